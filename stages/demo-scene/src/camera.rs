@@ -15,16 +15,10 @@ pub(crate) struct ViewCamera {
     pub(crate) sides: [u32; 2],
     /// Focal length in pixels.
     focal: f64,
-    lens: ViewLens,
-}
-
-/// Lens of a [`ViewCamera`].
-#[derive(Clone, Copy, Debug)]
-enum ViewLens {
-    /// Pinhole camera with a horizontal angle of view in radians.
-    Pinhole { angle_x: f64 },
-    /// Fisheye lens.
-    Fisheye(Intrinsics),
+    /// Horizontal angle of view of a pinhole camera in radians.
+    angle_x: f64,
+    /// Fisheye lens instead of a pinhole.
+    fisheye: Option<Intrinsics>,
 }
 
 impl ViewCamera {
@@ -40,28 +34,26 @@ impl ViewCamera {
         let Some(degrees) = params.training_angle() else { return test };
         let half_angle = 0.5 * degrees.to_radians();
         let distortion = Distortion::fisheye(FISHEYE_COEFFICIENTS);
-        let half_shorter_side = match params.projection {
-            Projection::Perspective => libm::tan(half_angle),
-            Projection::Fisheye => distortion.distort([libm::tan(half_angle), 0.0])[0],
-        };
+        let is_fisheye = params.projection == Projection::Fisheye;
+        let slope = libm::tan(half_angle);
+        let half_shorter_side =
+            if is_fisheye { distortion.distort([slope, 0.0])[0] } else { slope };
         let enlargement = half_shorter_side / libm::tan(0.5 * CAMERA_ANGLE);
         let sides = test.sides.map(|side| (f64::from(side) * enlargement).round().max(1.0) as u32);
         let [width, height] = sides;
         let [cx, cy] = sides.map(|side| 0.5 * f64::from(side));
-        match params.projection {
-            Projection::Perspective => Self::pinhole(sides, 2.0 * libm::atan(cx / test.focal)),
-            Projection::Fisheye => {
-                let (fx, fy) = (test.focal, test.focal);
-                let intrinsics = Intrinsics { width, height, fx, fy, cx, cy, distortion };
-                Self { sides, focal: test.focal, lens: ViewLens::Fisheye(intrinsics) }
-            }
+        if !is_fisheye {
+            return Self::pinhole(sides, 2.0 * libm::atan(cx / test.focal));
         }
+        let (fx, fy) = (test.focal, test.focal);
+        let intrinsics = Intrinsics { width, height, fx, fy, cx, cy, distortion };
+        Self { sides, fisheye: Some(intrinsics), ..test }
     }
 
     /// Creates a pinhole camera.
     fn pinhole(sides: [u32; 2], angle_x: f64) -> Self {
         let focal = 0.5 * f64::from(sides[0]) / libm::tan(0.5 * angle_x);
-        Self { sides, focal, lens: ViewLens::Pinhole { angle_x } }
+        Self { sides, focal, angle_x, fisheye: None }
     }
 
     /// Returns the direction of the ray at an image position, for a camera with axes right, up and
@@ -72,10 +64,10 @@ impl ViewCamera {
         [right, up, back]: [DVec3; 3],
     ) -> Option<DVec3> {
         let [half_x, half_y] = self.sides.map(|side| 0.5 * f64::from(side));
-        let [x, y] = match self.lens {
-            ViewLens::Pinhole { .. } => [x, y],
-            ViewLens::Fisheye(intrinsics) if intrinsics.is_clamped([x, y]) => return None,
-            ViewLens::Fisheye(intrinsics) => intrinsics.undistort([x, y]),
+        let [x, y] = match self.fisheye {
+            None => [x, y],
+            Some(intrinsics) if intrinsics.is_clamped([x, y]) => return None,
+            Some(intrinsics) => intrinsics.undistort([x, y]),
         };
         let across = (x - half_x) / self.focal;
         let down = (y - half_y) / self.focal;
@@ -84,9 +76,9 @@ impl ViewCamera {
 
     /// Returns the camera's entries in Blender's format.
     pub(crate) fn blender_entries(&self) -> Value {
-        match self.lens {
-            ViewLens::Pinhole { angle_x } => json!({"camera_angle_x": angle_x}),
-            ViewLens::Fisheye(_) => self.transforms_entries(),
+        match self.fisheye {
+            None => json!({"camera_angle_x": self.angle_x}),
+            Some(_) => self.transforms_entries(),
         }
     }
 
@@ -97,7 +89,7 @@ impl ViewCamera {
         let focal = self.focal;
         let mut entries =
             json!({"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy});
-        if let ViewLens::Fisheye(intrinsics) = self.lens {
+        if let Some(intrinsics) = self.fisheye {
             entries["camera_model"] = json!("OPENCV_FISHEYE");
             for (i, k) in intrinsics.distortion.radial.into_iter().enumerate() {
                 entries[format!("k{}", i + 1)] = json!(k);

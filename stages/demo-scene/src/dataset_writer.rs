@@ -19,11 +19,11 @@ use crate::render::RenderedImage;
 const JPEG_QUALITY: u8 = 95;
 
 impl Form {
-    /// Returns the folder of a split's images.
-    pub(crate) fn folder(self, split: &str) -> &str {
+    /// Returns the path of a view's image in the data set.
+    pub(crate) fn image_path(self, split: &str, number: usize) -> String {
         match self {
-            Self::Blender => split,
-            Self::Transforms => "images",
+            Self::Blender => format!("{split}/r_{number}.png"),
+            Self::Transforms => format!("images/{split}_{number}.jpg"),
         }
     }
 
@@ -32,38 +32,37 @@ impl Form {
         self,
         context: &Context,
         split: &str,
-        number: u32,
+        number: usize,
         image: &RenderedImage,
     ) -> anyhow::Result<()> {
+        let path = context.output_path(&self.image_path(split, number))?;
         if self == Self::Transforms {
-            let path = context.output_path(&photograph_name(split, number))?;
             return write_jpeg(&path, &image.colour)
                 .with_context(|| format!("cannot write {}", path.display()));
         }
-        write_png(&context.output_path(&format!("{split}/r_{number}.png"))?, &image.colour)?;
+        write_png(&path, &image.colour)?;
         if split == "test" {
-            write_depth(&context.output_path(&format!("test/r_{number}_depth.exr"))?, image)?;
+            write_depth(&context.output_path(&depth_path(number))?, image)?;
         }
         Ok(())
     }
 }
 
-/// Returns the path of a photograph in the data set.
-fn photograph_name(split: &str, number: u32) -> String {
-    format!("images/{split}_{number}.jpg")
+/// Returns the path of a test view's depth in Blender's format.
+fn depth_path(number: usize) -> String {
+    format!("test/r_{number}_depth.exr")
 }
 
 /// Writer of a data set's camera files.
 pub(crate) struct DatasetWriter {
     form: Form,
-    /// Camera of the test views, and of all frames without a camera of their own.
-    shared: ViewCamera,
     /// True if training views have a camera of their own.
     has_training_camera: bool,
+    /// Content of `transforms.json` without frames: the camera of the test views, and of all frames
+    /// without a camera of their own; image names of each split.
+    file: Value,
     /// Frames of `transforms.json`.
     frames: Vec<Value>,
-    /// Key and image names of each split in `transforms.json`.
-    splits: Vec<(String, Vec<String>)>,
 }
 
 impl DatasetWriter {
@@ -71,10 +70,9 @@ impl DatasetWriter {
     pub(crate) fn new(params: &Params) -> Self {
         Self {
             form: params.form,
-            shared: ViewCamera::of_test(params),
             has_training_camera: params.training_angle().is_some(),
+            file: ViewCamera::of_test(params).transforms_entries(),
             frames: Vec::new(),
-            splits: Vec::new(),
         }
     }
 
@@ -86,49 +84,46 @@ impl DatasetWriter {
         camera: &ViewCamera,
         poses: &[[[f64; 4]; 4]],
     ) -> anyhow::Result<()> {
-        if self.form == Form::Transforms {
-            let has_own_camera = self.has_training_camera && split == "train";
-            let own = if has_own_camera { camera.transforms_entries() } else { json!({}) };
-            let mut names = Vec::with_capacity(poses.len());
-            for (number, pose) in poses.iter().enumerate() {
-                let name = photograph_name(split, number as u32);
-                let mut frame = own.clone();
-                frame["file_path"] = json!(name);
-                frame["transform_matrix"] = json!(pose);
-                self.frames.push(frame);
-                names.push(name);
-            }
-            self.splits.push((format!("{split}_filenames"), names));
-            return Ok(());
-        }
+        let is_blender = self.form == Form::Blender;
+        let has_own_camera = !is_blender && self.has_training_camera && split == "train";
+        let own = if has_own_camera { camera.transforms_entries() } else { json!({}) };
+        let paths: Vec<String> = (0..poses.len()).map(|i| self.form.image_path(split, i)).collect();
         let mut frames = Vec::with_capacity(poses.len());
-        for (number, pose) in poses.iter().enumerate() {
-            let mut frame =
-                json!({"file_path": format!("./{split}/r_{number}"), "transform_matrix": pose});
-            if split == "test" {
-                frame["depth_file_path"] = json!(format!("./test/r_{number}_depth.exr"));
+        for (number, (pose, path)) in poses.iter().zip(&paths).enumerate() {
+            let mut frame = own.clone();
+            // Paths in Blender's format have no extension.
+            frame["file_path"] = match path.strip_suffix(".png") {
+                Some(stem) => json!(format!("./{stem}")),
+                None => json!(path),
+            };
+            frame["transform_matrix"] = json!(pose);
+            if is_blender && split == "test" {
+                frame["depth_file_path"] = json!(format!("./{}", depth_path(number)));
             }
             frames.push(frame);
         }
-        let mut file = camera.blender_entries();
-        file["frames"] = json!(frames);
-        context
-            .write_json(&format!("transforms_{split}.json"), &file)
-            .context("cannot write the cameras")
+        if is_blender {
+            let mut file = camera.blender_entries();
+            file["frames"] = json!(frames);
+            return write_cameras(context, &format!("transforms_{split}.json"), &file);
+        }
+        self.frames.extend(frames);
+        self.file[format!("{split}_filenames")] = json!(paths);
+        Ok(())
     }
 
     /// Writes `transforms.json` unless the format is Blender's.
-    pub(crate) fn finish(self, context: &Context) -> anyhow::Result<()> {
+    pub(crate) fn finish(mut self, context: &Context) -> anyhow::Result<()> {
         if self.form == Form::Blender {
             return Ok(());
         }
-        let mut file = self.shared.transforms_entries();
-        file["frames"] = json!(self.frames);
-        for (key, names) in self.splits {
-            file[key] = json!(names);
-        }
-        context.write_json("transforms.json", &file).context("cannot write the cameras")
+        self.file["frames"] = json!(self.frames);
+        write_cameras(context, "transforms.json", &self.file)
     }
+}
+
+fn write_cameras(context: &Context, name: &str, file: &Value) -> anyhow::Result<()> {
+    context.write_json(name, file).context("cannot write the cameras")
 }
 
 /// Writes an image, composited on white, as JPEG.

@@ -67,8 +67,6 @@ impl Stage for DemoScene {
         for (split, count, camera) in splits {
             let poses: Vec<[[f64; 4]; 4]> =
                 (0..count).map(|i| camera_pose(params.layout, split, i, count)).collect();
-            // Creates the folder.
-            context.output_path(&format!("{}/.", params.form.folder(split)))?;
             (0..count)
                 .into_par_iter()
                 .map(|i| {
@@ -79,7 +77,7 @@ impl Stage for DemoScene {
                     if split == "train" {
                         disturbance::expose(&mut image.colour, params, i);
                     }
-                    params.form.write_view(context, split, i, &image)
+                    params.form.write_view(context, split, i as usize, &image)
                 })
                 .collect::<anyhow::Result<Vec<()>>>()?;
             let stated_poses = (0..).zip(&poses).map(|(i, pose)| match split {

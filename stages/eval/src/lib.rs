@@ -120,7 +120,10 @@ impl Stage for Eval {
         let result = Metrics {
             conventions: conventions(&scene, &metrics),
             figures: metrics.iter().flat_map(|metric| metric.figures()).collect(),
-            picture_titles: picture_titles(&metrics),
+            picture_titles: metrics
+                .iter()
+                .filter_map(|metric| Some((metric.name(), metric.picture_title()?.to_owned())))
+                .collect(),
             mean: mean_of(scored.iter().map(|view| &view.scores)),
             least_gain: least_gain.flatten(),
             near_references,
@@ -141,16 +144,6 @@ fn min_scored_side(truth: &Views) -> usize {
     sides.min().map_or(usize::MAX, |side| side as usize)
 }
 
-fn picture_titles(metrics: &[Box<dyn Metric>]) -> BTreeMap<String, String> {
-    let mut titles = BTreeMap::new();
-    for metric in metrics {
-        if let Some(title) = metric.picture_title() {
-            titles.insert(metric.name().to_owned(), title.to_owned());
-        }
-    }
-    titles
-}
-
 /// Scores a view by every metric, and writes its error map and the metrics' pictures.
 fn score(
     context: &Context,
@@ -169,7 +162,7 @@ fn score(
         if let Some(picture) = measured.picture {
             let file = format!("{}s/{name}.png", metric.name());
             write_png(&context.output_path(&file)?, &picture)?;
-            pictures.insert(metric.name().to_owned(), file);
+            pictures.insert(metric.name(), file);
         }
     }
     Ok(ViewScores { name: name.clone(), scores, error_map, pictures })
@@ -200,7 +193,7 @@ fn conventions(scene: &ScoredScene<'_>, metrics: &[Box<dyn Metric>]) -> BTreeMap
         ("error_maps".to_owned(), error_maps),
     ]);
     for metric in metrics {
-        conventions.insert(metric.name().to_owned(), metric.convention(scene));
+        conventions.insert(metric.name(), metric.convention(scene));
     }
     conventions
 }

@@ -8,8 +8,12 @@ use crate::scored_view::{ScoredScene, ScoredView};
 /// Metric that scores views. A new metric is a type that implements this trait, and a line in the
 /// list of `scoring/mod.rs`; `metrics.json`, the page and the summary follow from its methods.
 pub(crate) trait Metric: Sync {
-    /// Returns the key of the metric's convention, which is also the name of its pictures.
-    fn name(&self) -> &'static str;
+    /// Returns the key of the metric's convention, which is also the name of its pictures: the first
+    /// key in the paths of its figures.
+    fn name(&self) -> String {
+        let path = self.figures().swap_remove(0).path;
+        path.split('/').next().unwrap_or_default().to_owned()
+    }
     /// Returns the formats of the metric's scores, the most important first.
     fn figures(&self) -> Vec<ScoreFormat>;
     /// Describes the definition of the scores.
@@ -54,42 +58,33 @@ pub(crate) fn value(scores: &Scores, path: &str) -> Option<f64> {
 
 /// Returns the mean of each value over the views that have it.
 pub(crate) fn mean_of<'a>(views: impl Iterator<Item = &'a Scores>) -> Scores {
-    let mut sums = Sums::new();
+    // Sum and number of values, by name and part.
+    let mut sums: BTreeMap<(&str, Option<&str>), (f64, usize)> = BTreeMap::new();
+    let mut add = |key, value: &f64| {
+        let (sum, count) = sums.entry(key).or_default();
+        *sum += value;
+        *count += 1;
+    };
     for (name, score) in views.flatten() {
         match score {
-            Score::One(value) => add(&mut sums, (name, None), *value),
+            Score::One(value) => add((name, None), value),
             Score::Several(parts) => {
-                for (part, value) in parts {
-                    add(&mut sums, (name, Some(part)), *value);
-                }
+                parts.iter().for_each(|(part, value)| add((name, Some(part)), value));
             }
         }
     }
     let mut means = Scores::new();
     for ((name, part), (sum, count)) in sums {
         let mean = sum / count as f64;
-        match part {
-            None => {
-                means.insert(name.to_owned(), Score::One(mean));
-            }
-            Some(part) => {
-                let several = means.entry(name.to_owned()).or_insert_with(|| Score::several([]));
-                if let Score::Several(parts) = several {
-                    parts.insert(part.to_owned(), mean);
-                }
+        let several = part.map(|part| Score::several([(part, mean)]));
+        match (means.get_mut(name), several) {
+            (Some(Score::Several(parts)), Some(Score::Several(more))) => parts.extend(more),
+            (_, several) => {
+                means.insert(name.to_owned(), several.unwrap_or(Score::One(mean)));
             }
         }
     }
     means
-}
-
-/// Sum and number of values, by name and part.
-type Sums<'a> = BTreeMap<(&'a str, Option<&'a str>), (f64, usize)>;
-
-fn add<'a>(sums: &mut Sums<'a>, key: (&'a str, Option<&'a str>), value: f64) {
-    let (sum, count) = sums.entry(key).or_default();
-    *sum += value;
-    *count += 1;
 }
 
 #[cfg(test)]

@@ -28,14 +28,10 @@ impl Stage for CopyFiles {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![(
-            "run",
-            Input::required(
-                &["run"],
-                "in pipeline.yaml: a block whose artifact is copied; nerf-sr passes a folder \
-                with its record, run.json",
-            ),
-        )]
+        Input::run(
+            "in pipeline.yaml: a block whose artifact is copied; nerf-sr passes a folder with its \
+            record, run.json",
+        )
     }
 
     fn output() -> Output {

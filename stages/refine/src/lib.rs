@@ -105,20 +105,19 @@ impl Stage for Refine {
         let file: RefinerFile = refiner.read_json(REFINER_FILE)?;
         let views_input = context.input("views")?;
         let mut views = Views::read(views_input)?;
+        let [photographs, enlarged] =
+            ["photographs", "enlarged"].map(|name| context.optional_input(name));
         let job = RefineJob {
             context,
             views_input,
             background: views.background.grey_level(),
             network: AnyRefiner::read(refiner, &file)?,
-            application: Application::new(params, &file),
-            photographs: context
-                .optional_input("photographs")
-                .map(LrObservations::read)
-                .transpose()?,
-            enlarged: context
-                .optional_input("enlarged")
-                .map(EnlargedPhotographs::read)
-                .transpose()?,
+            application: Application {
+                residual_weight: file.residual_weight as f32,
+                self_ensemble: params.self_ensemble,
+            },
+            photographs: photographs.map(LrObservations::read).transpose()?,
+            enlarged: enlarged.map(EnlargedPhotographs::read).transpose()?,
             expects_consistent: file.data_consistent,
         };
         let references = usable_references(&job, &views, params, file.confidence.unwrap_or(1.0))?;
@@ -173,7 +172,7 @@ fn refine_all(
         summary.consistent += usize::from(refined.is_consistent);
         summary.averaged +=
             usize::from(job.enlarged.as_ref().is_some_and(|enlarged| enlarged.has(&view.camera)));
-        network::add_statistics(&mut summary.statistics, &refined.statistics);
+        ReferenceStatistics::add_each(&mut summary.statistics, &refined.statistics);
         view.depth = view.depth.as_ref().map(|_| image.clone());
         view.image = Some(image);
         // These files of the input aren't copied.

@@ -6,8 +6,6 @@ use refinement::{
     WarpOptions, with_references,
 };
 
-use crate::Params;
-
 /// Trained network of either kind.
 pub(crate) enum AnyRefiner {
     /// Our network.
@@ -24,13 +22,6 @@ pub(crate) struct Application {
     /// Number of rotated and mirrored versions whose residuals are averaged; the paper's network
     /// ignores it.
     pub(crate) self_ensemble: u32,
-}
-
-impl Application {
-    /// Returns the settings of the parameters and of the trained network.
-    pub(crate) fn new(params: &Params, file: &RefinerFile) -> Self {
-        Self { residual_weight: file.residual_weight as f32, self_ensemble: params.self_ensemble }
-    }
 }
 
 impl AnyRefiner {
@@ -68,16 +59,14 @@ impl AnyRefiner {
         let &Application { residual_weight, self_ensemble } = application;
         match self {
             Self::Compact(network) => {
-                let Some(warp_options) = self.warp_options() else {
-                    return Ok(network.refine_weighted(
-                        &rendered.view,
-                        residual_weight,
-                        self_ensemble,
-                    )?);
-                };
-                let conditioned = with_references(rendered, &references, warp_options);
-                add_statistics(statistics, &conditioned.statistics);
-                Ok(network.refine_weighted(&conditioned.view, residual_weight, self_ensemble)?)
+                let conditioned = self
+                    .warp_options()
+                    .map(|warp_options| with_references(rendered, &references, warp_options));
+                if let Some(conditioned) = &conditioned {
+                    ReferenceStatistics::add_each(statistics, &conditioned.statistics);
+                }
+                let view = conditioned.as_ref().map_or(&rendered.view, |known| &known.view);
+                Ok(network.refine_weighted(view, residual_weight, self_ensemble)?)
             }
             Self::Paper(network, patches) => {
                 let mut drawn =
@@ -86,13 +75,6 @@ impl AnyRefiner {
                 Ok(drawn)
             }
         }
-    }
-}
-
-/// Adds each reference's statistics to its sum.
-pub(crate) fn add_statistics(sums: &mut [ReferenceStatistics], statistics: &[ReferenceStatistics]) {
-    for (i, sum) in sums.iter_mut().enumerate() {
-        sum.add(&statistics[i]);
     }
 }
 

@@ -4,7 +4,6 @@ use refinement::{KnownView, ReferenceStatistics, Rendered, WarpOptions, with_ref
 use scene::{Background, View, Views};
 use stage::Context;
 
-use crate::network::add_statistics;
 use crate::view::{RefineJob, read_view};
 
 /// Reads the references of a network that takes them; for other networks, logs that references are
@@ -90,7 +89,7 @@ pub(crate) fn remove_misleading(
     ReferenceJudge {
         views: &views.views,
         warp_options,
-        read: &|view| Ok(job.read(view)?.rendered),
+        read: &|view| Ok(job.read(view)?.0),
         log: &|note| job.context.log_line(note),
     }
     .retain_reliable(references, confidence)
@@ -159,7 +158,7 @@ impl ReferenceJudge<'_> {
                 *depth *= depth_factor;
             }
             let conditioned = with_references(&rendered, &references, warp_options);
-            add_statistics(&mut statistics, &conditioned.statistics);
+            ReferenceStatistics::add_each(&mut statistics, &conditioned.statistics);
         }
         Ok(statistics.iter().map(ReferenceStatistics::confidence_share).collect())
     }

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use artifact::{Failure, GivenInput};
-use pixels::{ExrImage, Image, write_png};
+use pixels::{Channel, ExrImage, Image, write_png};
 use refinement::{KnownView, LrObservations, ReferenceStatistics, Rendered};
 use scene::{Photograph, VIEW_CHANNELS, View, write_view_image};
 use serde::{Deserialize, Serialize};
@@ -45,16 +45,6 @@ pub(crate) struct RefineJob<'a> {
     pub(crate) expects_consistent: bool,
 }
 
-/// View to refine.
-pub(crate) struct ViewToRefine {
-    /// Render in the form that the network takes.
-    pub(crate) rendered: Rendered,
-    /// All channels of the view's file.
-    file: ExrImage,
-    /// LR photograph of the same camera.
-    photograph: Option<Photograph>,
-}
-
 impl RefineJob<'_> {
     /// Refines one view and writes its files at the paths of image and preview in the output.
     pub(crate) fn refine(
@@ -63,7 +53,7 @@ impl RefineJob<'_> {
         references: &[KnownView],
         [image, preview]: [&str; 2],
     ) -> anyhow::Result<RefinedView> {
-        let ViewToRefine { rendered, file, photograph } = self.read(view)?;
+        let (rendered, file, photograph) = self.read(view)?;
         let mut statistics = vec![ReferenceStatistics::default(); references.len()];
         let mut refined =
             self.network.refine(&rendered, references, &self.application, &mut statistics)?;
@@ -77,19 +67,21 @@ impl RefineJob<'_> {
         Ok(RefinedView { is_consistent: photograph.is_some(), statistics })
     }
 
-    /// Reads a view.
-    pub(crate) fn read(&self, view: &View) -> Result<ViewToRefine, Failure> {
+    /// Reads a view in the form that the network takes, all channels of its file, and the LR
+    /// photograph of the same camera.
+    pub(crate) fn read(
+        &self,
+        view: &View,
+    ) -> Result<(Rendered, ExrImage, Option<Photograph>), Failure> {
         let needs_depth = self.network.takes_references();
         let (mut rendered, file) = read_view(self.views_input, view, self.background, needs_depth)?;
-        let photograph = match &self.photographs {
-            Some(photographs) => photographs.photograph(&view.camera)?,
-            None => None,
-        };
+        let photographs = self.photographs.as_ref();
+        let photograph = photographs.map(|p| p.photograph(&view.camera)).transpose()?.flatten();
         if self.expects_consistent {
             let colours = self.make_consistent(rendered.colours(), photograph.as_ref());
             rendered = rendered.with_colours(&colours);
         }
-        Ok(ViewToRefine { rendered, file, photograph })
+        Ok((rendered, file, photograph))
     }
 
     /// Makes an image of a view consistent with the view's LR photograph, if any.
@@ -110,13 +102,9 @@ fn write_recoloured(
     opacity: &[f32],
     background: f32,
 ) -> anyhow::Result<()> {
-    let (mut channels, mut samples_of) = (Vec::new(), Vec::new());
-    for channel in VIEW_CHANNELS {
-        if let Some(samples) = image.channel(channel.name) {
-            channels.push(channel);
-            samples_of.push(samples);
-        }
-    }
+    let channels = VIEW_CHANNELS.into_iter();
+    let (channels, samples_of): (Vec<Channel>, Vec<&[f32]>) =
+        channels.filter_map(|channel| Some((channel, image.channel(channel.name)?))).unzip();
     let size = (image.width, image.height);
     write_view_image(path, size, &channels, |first, _, samples| {
         for (i, pixel) in samples.chunks_exact_mut(channels.len()).enumerate() {

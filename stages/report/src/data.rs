@@ -1,13 +1,14 @@
 use std::collections::BTreeMap;
 
 use artifact::RunNode;
-use metrics::ERROR_MAP_RANGE;
+use metrics::{ERROR_MAP_RANGE, ScoreFormat};
 use radiance::{TRAINING_FILE, TrainingLog};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::Context;
 
-use crate::gather::{Report, Row, has_values};
+use crate::gather::{Report, Row};
+use crate::heading::read_json;
 use crate::layers::{Group, Layer, layers, max_pixels};
 use crate::pictures::{Picture, Request, write_pictures};
 use crate::scale::Scale;
@@ -153,14 +154,12 @@ impl Data {
             scenes: report.scenes.iter().map(|scene| scene.data_set.clone()).collect(),
             view: requested.unwrap_or(first),
             crop: params.crop,
-            best: report
-                .best()
-                .and_then(|best| report.rows.iter().position(|r| r.index == best.index)),
+            best: report.best_row(),
             figures: figures(report),
             rows: report.rows.iter().map(|row| row_data(report, row)).collect(),
             layers: layer_data,
             scales,
-            curves: curves(&report.run.nodes),
+            curves: report.run.nodes.iter().filter_map(curve).collect(),
             pictures,
             views,
         })
@@ -219,7 +218,10 @@ fn layer_data(
     for layer in layers {
         let scale = match (&layer.group, layer.rows.first().map(|&row| &report.rows[row])) {
             (Group::Depth, _) => Some(Scale::depth(depths[layer.scene])),
-            (Group::Error, Some(row)) => Some(error_scale(row)),
+            // Without HR truth, error maps show errors at LR.
+            (Group::Error, Some(row)) => {
+                Some(Scale::error(ERROR_MAP_RANGE, !row.metrics.has_hr_truth()))
+            }
             _ => None,
         };
         let index = scale.map(|scale| {
@@ -240,27 +242,18 @@ fn layer_data(
     (data, scales)
 }
 
-/// Returns the scale of a row's error maps; without HR truth they show errors at LR.
-fn error_scale(row: &Row<'_>) -> Scale {
-    Scale::error(ERROR_MAP_RANGE, !row.metrics.has_hr_truth())
-}
-
 fn figures(report: &Report<'_>) -> Vec<FigureData> {
-    let known = report.figures.iter().filter(|figure| has_values(figure, &report.rows));
-    known
-        .map(|figure| FigureData {
-            label: figure.label.clone(),
-            digits: figure.digits,
-            higher_is_better: figure.higher_is_better,
-            definition: definition(report, figure)
-                .map(|(_, text)| text.to_owned())
-                .unwrap_or_default(),
-        })
-        .collect()
+    let data = |figure: &ScoreFormat| FigureData {
+        label: figure.label.clone(),
+        digits: figure.digits,
+        higher_is_better: figure.higher_is_better,
+        definition: definition(report, figure).map_or("", |(_, text)| text).to_owned(),
+    };
+    report.known_figures().into_iter().map(data).collect()
 }
 
 fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
-    let known: Vec<_> = report.figures.iter().filter(|f| has_values(f, &report.rows)).collect();
+    let known = report.known_figures();
     let mut scores = Vec::new();
     for (scene, scene_views) in report.scenes.iter().enumerate() {
         for name in &scene_views.views {
@@ -279,14 +272,9 @@ fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
     }
 }
 
-/// Returns the training curves of all artifacts that have one.
-fn curves(nodes: &[RunNode]) -> Vec<Curve> {
-    nodes.iter().filter_map(curve).collect()
-}
-
+/// Returns the training curve of an artifact that has one.
 fn curve(node: &RunNode) -> Option<Curve> {
-    let bytes = std::fs::read(node.folder.join(TRAINING_FILE)).ok()?;
-    let log: TrainingLog = serde_json::from_slice(&bytes).ok()?;
+    let log: TrainingLog = read_json(node, TRAINING_FILE)?;
     let points: Vec<[f64; 2]> = log.curve.iter().map(|p| [p.rays as f64, p.psnr]).collect();
     let label = artifact::label(&node.stage, &node.point);
     (points.len() > 1).then_some(Curve { label, points })

@@ -1,5 +1,8 @@
+use std::cmp::Ordering;
+
 use artifact::{RunNode, RunRecord};
 use metrics::{AnyMetrics, ScoreFormat};
+use scene::Views;
 use serde_json::Value;
 
 use crate::results::scored_nodes;
@@ -31,8 +34,6 @@ pub(crate) struct SceneViews {
 /// Scores of the views that one method rendered: a result, and a row of the tables.
 pub(crate) struct Row<'a> {
     pub(crate) node: &'a RunNode,
-    /// Index of the node in the run.
-    pub(crate) index: usize,
     /// Content of `metrics.json`.
     pub(crate) metrics: AnyMetrics,
     /// Name that is unique among the rows.
@@ -80,9 +81,9 @@ impl<'a> Report<'a> {
             }
         }
         for index in unscored_nodes(run) {
-            let Some(names) = UnscoredViews::read_names(run, index) else { continue };
+            let Ok(views) = Views::read_folder(&run.nodes[index].folder) else { continue };
             let scene = report.scene(index);
-            report.add_views(scene, names.iter().map(String::as_str));
+            report.add_views(scene, views.views.iter().map(|view| view.camera.name.as_str()));
             report.unscored.push(UnscoredViews::new(run, index, scene));
         }
         report.figures = figures(&report.rows);
@@ -120,54 +121,44 @@ impl<'a> Report<'a> {
             .training_and_rendering(index)
             .map(|nodes| nodes.iter().map(|&i| self.run.nodes[i].seconds).sum::<f64>() + 0.0);
         let label = String::new();
-        self.rows.push(Row { node, index, metrics, label, scene, training, rendering });
+        self.rows.push(Row { node, metrics, label, scene, training, rendering });
     }
 
     /// Labels rows by their values in the sweep and, without a sweep or if several blocks score, by
     /// the scored method.
     fn label_rows(&mut self) {
-        let Some(first) = self.rows.first() else { return };
-        let stage = &first.node.stage;
-        let has_blocks = self.rows.iter().any(|row| row.node.stage != *stage);
-        let methods: Vec<(String, String)> = self
-            .rows
-            .iter()
-            .map(|row| (method(self.run, row.node), row.node.stage.clone()))
+        let methods: Vec<(String, &str)> = (self.rows.iter())
+            .map(|row| (method(self.run, row.node), row.node.stage.as_str()))
             .collect();
-        for row in &mut self.rows {
-            let own = method(self.run, row.node);
+        let has_blocks = methods.iter().any(|(_, block)| *block != methods[0].1);
+        for (row, (own, block)) in self.rows.iter_mut().zip(&methods) {
             // Two blocks may score views of the same method.
-            let is_shared =
-                methods.iter().any(|(other, stage)| *other == own && *stage != row.node.stage);
-            let method = if is_shared { row.node.stage.clone() } else { own };
-            let point = row.node.point.as_str();
-            row.label = match (has_blocks, point) {
-                (_, "") => method,
+            let is_shared = methods.iter().any(|other| other.0 == *own && other.1 != *block);
+            let method = if is_shared { block } else { own.as_str() };
+            row.label = match (has_blocks, row.node.point.as_str()) {
+                (_, "") => method.to_owned(),
                 (false, point) => point.to_owned(),
                 (true, point) => format!("{method}, {point}"),
             };
         }
     }
 
-    /// Returns the row with the best mean of the first figure. Without figures, returns the first
-    /// row.
-    pub(crate) fn best(&self) -> Option<&Row<'a>> {
+    /// Returns the index of the row with the best mean of the first figure, the first of equal
+    /// ones. Without figures, returns that of the first row.
+    pub(crate) fn best_row(&self) -> Option<usize> {
         let figure = self.figures.first();
-        let lower_is_better = figure.and_then(|f| f.higher_is_better) == Some(false);
-        let mut best: Option<(&Row<'a>, Option<f64>)> = None;
-        for row in &self.rows {
-            let value = figure.and_then(|figure| row.mean(figure));
-            let is_better = match (best, value) {
-                (None, _) | (Some((_, None)), Some(_)) => true,
-                (Some((_, Some(old))), Some(new)) if lower_is_better => new < old,
-                (Some((_, Some(old))), Some(new)) => new > old,
-                (Some(_), None) => false,
-            };
-            if is_better {
-                best = Some((row, value));
-            }
-        }
-        best.map(|(row, _)| row)
+        let is_lower_better = figure.is_some_and(|f| f.higher_is_better == Some(false));
+        let sign = if is_lower_better { -1.0 } else { 1.0 };
+        let value = |&row: &usize| Some(sign * self.rows[row].mean(figure?)?);
+        // The last of equal ones is the maximum.
+        (0..self.rows.len())
+            .rev()
+            .max_by(|a, b| value(a).partial_cmp(&value(b)).unwrap_or(Ordering::Equal))
+    }
+
+    /// Returns the figures of which any row has a value.
+    pub(crate) fn known_figures(&self) -> Vec<&ScoreFormat> {
+        self.figures.iter().filter(|figure| has_values(figure, &self.rows)).collect()
     }
 }
 
@@ -211,11 +202,8 @@ fn numbers(mean: &Value) -> Vec<ScoreFormat> {
     let entries = mean.as_object().into_iter().flatten().filter(|(_, value)| value.is_number());
     entries
         .map(|(name, _)| ScoreFormat {
-            path: name.clone(),
-            label: name.clone(),
-            digits: 4,
             higher_is_better: None,
-            missing: None,
+            ..ScoreFormat::new(name, name, 4, true)
         })
         .collect()
 }

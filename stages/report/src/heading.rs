@@ -10,7 +10,10 @@ use serde::de::DeserializeOwned;
 /// Maximum number of different values of a fact that are listed; chosen by hand.
 const MAX_VALUES: usize = 3;
 
-/// Part of `scene.json`, the summary of a scene.
+/// Name of a scene's summary.
+const SCENE_FILE: &str = "scene.json";
+
+/// Part of [`SCENE_FILE`].
 #[derive(Deserialize)]
 struct SceneFile {
     lr: [u32; 2],
@@ -23,7 +26,7 @@ struct SceneFile {
 pub(crate) fn facts(run: &RunRecord) -> Vec<(&'static str, String)> {
     let scenes = run.nodes.iter().filter(|node| node.kind == "scene");
     let sizes = scenes
-        .filter_map(read_scene)
+        .filter_map(|node| read_json(node, SCENE_FILE))
         .map(|SceneFile { lr, hr, .. }| format!("LR {}×{} → HR {}×{}", lr[0], lr[1], hr[0], hr[1]));
     let fields = (0..run.nodes.len()).filter(|&index| run.nodes[index].kind == "field");
     let rays = fields.filter_map(|index| rays_of_field(run, index));
@@ -47,20 +50,17 @@ fn joined(values: BTreeSet<String>) -> String {
 /// Returns the number of rays of a training, also per LR pixel of its training views.
 fn rays_of_field(run: &RunRecord, index: usize) -> Option<String> {
     let node = &run.nodes[index];
-    let log: TrainingLog = read(node, TRAINING_FILE)?;
+    let log: TrainingLog = read_json(node, TRAINING_FILE)?;
     // Only fields trained on `train` are listed: a field of `downscaled` has other LR pixels.
     let scene = node.inputs.get("scene").filter(|input| input.subtree.as_deref() == Some("train"));
-    let scene = read_scene(&run.nodes[scene?.node?])?;
+    let scene: SceneFile = read_json(&run.nodes[scene?.node?], SCENE_FILE)?;
     let pixels = u64::from(scene.lr[0]) * u64::from(scene.lr[1]) * scene.train;
     let per_pixel = log.rays as f64 / pixels.max(1) as f64;
     Some(format!("{}, {per_pixel:.1} per LR pixel", format_amount(log.rays)))
 }
 
-fn read_scene(node: &RunNode) -> Option<SceneFile> {
-    read(node, "scene.json")
-}
-
-fn read<T: DeserializeOwned>(node: &RunNode, file: &str) -> Option<T> {
+/// Reads a JSON file of an artifact; `None` if it is missing or of another form.
+pub(crate) fn read_json<T: DeserializeOwned>(node: &RunNode, file: &str) -> Option<T> {
     let bytes = std::fs::read(node.folder.join(file)).ok()?;
     serde_json::from_slice(&bytes).ok()
 }

@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use artifact::Manifest;
-use pixels::{DepthMap, ExrImage, Rgba8, common_range, read_exr, read_png};
+use pixels::{DepthMap, Rgba8, common_range, read_exr, read_png};
 use scene::{View, Views};
 use serde_json::Value;
 
@@ -68,20 +68,10 @@ impl Folder {
         format!("{:?} {}", self.views.background, files_identity(&self.path, files))
     }
 
-    fn view(&self, name: &str) -> Option<&View> {
-        self.views.views.iter().find(|view| view.camera.name == name)
-    }
-
-    /// Reads an image of the folder, if any, over the background.
-    fn colour(&self, file: Option<&String>) -> anyhow::Result<Option<Rgba8>> {
-        let Some(file) = file else { return Ok(None) };
-        Ok(Some(self.views.read_over(&self.path.join(file))?.to_rgba8()))
-    }
-
-    /// Reads the depth map of a view, if available.
-    fn depth(&self, name: &str) -> anyhow::Result<Option<ExrImage>> {
-        let file = self.view(name).and_then(|view| view.depth.as_ref());
-        Ok(file.map(|file| read_exr(&self.path.join(file))).transpose()?)
+    /// Returns the path of the file of a view that a group displays, if any.
+    fn file(&self, view: &str, group: &Group) -> Option<PathBuf> {
+        let view = self.views.views.iter().find(|other| other.camera.name == view)?;
+        group.file(view).map(|file| self.path.join(file))
     }
 }
 
@@ -133,12 +123,13 @@ impl Layer<'_> {
     /// Draws the picture of a view, if available; `range` is that of the depths' colours.
     pub(crate) fn picture(&self, view: &str, range: (f32, f32)) -> anyhow::Result<Option<Rgba8>> {
         match &self.source {
-            Source::Views(folder) if self.group == Group::Depth => {
-                let image = folder.depth(view)?;
-                Ok(image.and_then(|image| Some(DepthMap::of(&image)?.draw(image.width, range))))
-            }
             Source::Views(folder) => {
-                folder.colour(folder.view(view).and_then(|view| self.group.file(view)))
+                let Some(path) = folder.file(view, &self.group) else { return Ok(None) };
+                if self.group != Group::Depth {
+                    return Ok(Some(folder.views.read_over(&path)?.to_rgba8()));
+                }
+                let image = read_exr(&path)?;
+                Ok(DepthMap::of(&image).map(|map| map.draw(image.width, range)))
             }
             Source::Scored(row, pointer) => {
                 let file = row.view(view).and_then(|scores| scores.pointer(pointer)?.as_str());
@@ -158,9 +149,8 @@ impl Layer<'_> {
             return Ok(None);
         };
         let mut ranges = Vec::new();
-        for view in views {
-            let image = folder.depth(view)?;
-            ranges.extend(image.and_then(|image| DepthMap::of(&image)?.range()));
+        for path in views.filter_map(|view| folder.file(view, &self.group)) {
+            ranges.extend(DepthMap::of(&read_exr(&path)?).and_then(|map| map.range()));
         }
         Ok(common_range(ranges))
     }
@@ -185,20 +175,17 @@ pub(crate) fn max_pixels(layers: &[Layer<'_>], scene: usize) -> u64 {
 /// Returns all layers: observations first, then those of each method.
 pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>>> {
     let mut layers = Vec::new();
-    let mut truths: Vec<(PathBuf, usize, Option<Arc<Folder>>)> = Vec::new();
+    let mut truths: Vec<(PathBuf, usize)> = Vec::new();
     for row in &report.rows {
-        let Some(path) = folder_of(report, row, "truth") else { continue };
-        if !truths.iter().any(|(other, scene, _)| *other == path && *scene == row.scene) {
-            let folder = has_views(&path).then(|| Folder::read(path.clone())).transpose()?;
-            truths.push((path, row.scene, folder));
-        }
+        let truth = folder_of(report, row, "truth").map(|path| (path, row.scene));
+        truths.extend(truth.filter(|truth| !truths.contains(truth)));
     }
-    for (path, scene, folder) in &truths {
-        let Some(folder) = folder else { continue };
-        add_observations(&mut layers, *scene, folder, &scored_on(report, path));
+    for (path, scene) in truths.iter().filter(|(path, _)| has_views(path)) {
+        let folder = Folder::read(path.clone())?;
+        add_observations(&mut layers, *scene, &folder, &scored_on(report, path));
     }
     for views in &report.unscored {
-        let has_truth = truths.iter().any(|(_, scene, _)| *scene == views.scene);
+        let has_truth = truths.iter().any(|(_, scene)| *scene == views.scene);
         if let Some(truth) = views.truth.clone().filter(|_| !has_truth) {
             add_observations(&mut layers, views.scene, &Folder::read(truth)?, &views.label);
         }
@@ -299,31 +286,22 @@ fn add_method<'a>(
         scored.push((Group::Metric { name: name.to_owned(), title: title.to_owned() }, pointer));
     }
     for (group, pointer) in scored {
-        if has_files(row, &pointer) {
-            let views = row.metrics.views().iter();
-            let files = views
-                .map(|view| (view["name"].as_str().unwrap_or_default(), view.pointer(&pointer)));
-            let files = files.map(|(view, file)| (view, file.and_then(Value::as_str)));
-            let identity = files_identity(&row.node.folder, files);
-            let source = Source::Scored(row, pointer);
-            let label = label.clone();
+        let files = row.metrics.views().iter().map(|view| {
+            let file = view.pointer(&pointer).and_then(Value::as_str);
+            (view["name"].as_str().unwrap_or_default(), file)
+        });
+        if files.clone().any(|(_, file)| file.is_some()) {
             layers.push(Layer {
-                label,
+                label: label.clone(),
                 group,
                 scene: row.scene,
                 rows: vec![index],
-                identity,
-                source,
+                identity: files_identity(&row.node.folder, files),
+                source: Source::Scored(row, pointer),
             });
         }
     }
     Ok(())
-}
-
-/// True if the scores of some view name a file at `pointer`.
-fn has_files(row: &Row<'_>, pointer: &str) -> bool {
-    let mut views = row.metrics.views().iter();
-    views.any(|view| view.pointer(pointer).is_some_and(Value::is_string))
 }
 
 fn folder_of(report: &Report<'_>, row: &Row<'_>, input: &str) -> Option<PathBuf> {

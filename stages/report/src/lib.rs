@@ -38,7 +38,7 @@ mod scale;
 mod tables;
 mod unscored;
 
-use artifact::{Failure, RunRecord, bail_usage, format_count, format_size};
+use artifact::{RunRecord, bail_usage, format_count, format_size};
 use stage::{Context, Input, Output, Stage};
 
 pub use data::Params;
@@ -60,14 +60,10 @@ impl Stage for Report {
     const ACCEPTS_FAILURES: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![(
-            "run",
-            Input::required(
-                &["run"],
-                "in pipeline.yaml: a block of `eval`, and further blocks, each under a name of \
-                your choice; nerf-sr passes a folder with their record, run.json",
-            ),
-        )]
+        Input::run(
+            "in pipeline.yaml: a block of `eval`, and further blocks, each under a name of your \
+            choice; nerf-sr passes a folder with their record, run.json",
+        )
     }
 
     fn output() -> Output {
@@ -75,8 +71,7 @@ impl Stage for Report {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let run = RunRecord::read(context.input("run")?)?;
         if let Some([.., 0]) = params.crop {
             bail_usage!("parameter crop: expected a side of at least 1 pixel, found 0");
         }

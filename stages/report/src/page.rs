@@ -83,11 +83,6 @@ fn data_sets(report: &Report<'_>) -> Vec<String> {
     report.scenes.iter().map(|scene| scene.data_set.clone()).collect()
 }
 
-/// Returns the time at which the last stage ended, in seconds since 1970.
-fn end_time(run: &RunRecord) -> Option<u64> {
-    run.nodes.iter().map(|node| node.started_unix + node.seconds.max(0.0) as u64).max()
-}
-
 fn has_pipeline(run: &RunRecord) -> bool {
     !run.nodes.is_empty() || !run.unfinished.is_empty()
 }
@@ -96,6 +91,7 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
     let run = report.run;
     let views: usize = report.scenes.iter().map(|scene| scene.views.len()).sum();
     let has_pipeline = has_pipeline(run);
+    let ends = run.nodes.iter().map(|node| node.started_unix + node.seconds.max(0.0) as u64);
     let sets = data_sets(report);
     let links = [
         ("compare", "Compare", has_pictures),
@@ -116,7 +112,7 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
                         @if sets.len() > MAX_NAMES { "and " (sets.len() - MAX_NAMES) " more" }
                     }
                 }
-                @if let Some(ended) = end_time(run) {
+                @if let Some(ended) = ends.max() {
                     div { dt { "Date" } dd { time { (format_utc(ended)) } } }
                 }
                 @if let Some(commit) = run.commit() {

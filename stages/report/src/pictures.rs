@@ -150,7 +150,8 @@ fn write_original(
 
 /// Predicts from a sample of the pictures the index of the best quality that fits into the budget.
 fn predict_quality(originals: &[Original], budget: usize) -> anyhow::Result<usize> {
-    let all: usize = originals.iter().map(|original| base64_length(original.bytes)).sum();
+    // Lengths in Base64.
+    let all: usize = originals.iter().map(|original| original.bytes.div_ceil(3) * 4).sum();
     if all <= budget.min(LOSSLESS_BYTES) {
         return Ok(0);
     }
@@ -167,10 +168,6 @@ fn predict_quality(originals: &[Original], budget: usize) -> anyhow::Result<usiz
         }
     }
     Ok(QUALITIES.len() - 1)
-}
-
-fn base64_length(bytes: usize) -> usize {
-    bytes.div_ceil(3) * 4
 }
 
 /// Makes the copy of an original.

@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use artifact::{RunNode, RunRecord, warnings_of};
+use artifact::{RunNode, RunRecord, label, warnings_of};
 use metrics::AnyMetrics;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -42,17 +42,13 @@ pub struct StageResult {
 /// Returns the warnings in the stages' summaries, each with its node's name, in the order of the
 /// run.
 pub(crate) fn warnings_by_node(run: &RunRecord) -> Vec<(String, String)> {
-    run.nodes.iter().flat_map(warnings_of_node).collect()
-}
-
-fn warnings_of_node(node: &RunNode) -> Vec<(String, String)> {
-    let summary = std::fs::read_to_string(node.folder.join(SUMMARY_FILE)).unwrap_or_default();
-    let name = if node.point.is_empty() {
-        node.stage.clone()
-    } else {
-        format!("{} [{}]", node.stage, node.point)
-    };
-    warnings_of(&summary).map(|warning| (name.clone(), warning.to_owned())).collect()
+    let mut warnings = Vec::new();
+    for node in &run.nodes {
+        let summary = std::fs::read_to_string(node.folder.join(SUMMARY_FILE)).unwrap_or_default();
+        let name = label(&node.stage, &node.point);
+        warnings.extend(warnings_of(&summary).map(|text| (name.clone(), text.to_owned())));
+    }
+    warnings
 }
 
 /// Returns the nodes that scored views, each with its index: those with fewer stages before them

@@ -18,7 +18,7 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
     if report.scenes.len() > 1 {
         return html! {};
     }
-    let Some(best) = report.best() else {
+    let Some(best) = report.best_row().map(|best| &report.rows[best]) else {
         return html! { p class="note" { "There are no scores." } };
     };
     let known = report.figures.iter().filter_map(|figure| Some((figure, best.mean(figure)?)));
@@ -51,7 +51,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
     if rows.is_empty() {
         return html! {};
     }
-    let known: Vec<&ScoreFormat> = report.figures.iter().filter(|f| has_values(f, rows)).collect();
+    let known = report.known_figures();
     let with_data_sets = report.scenes.len() > 1;
     html! {
         section id="scores" aria-labelledby="scores-heading" {
@@ -112,15 +112,12 @@ pub(crate) fn definition<'a>(
     // A result without this figure may state why it isn't measured.
     let row = report.rows.iter().find(|row| row.mean(figure).is_some())?;
     let conventions = row.metrics.conventions().as_object()?;
-    // Networks of LPIPS share a definition.
-    let (name, text) =
-        conventions.iter().find(|(name, _)| metric == *name || is_variant(metric, name))?;
+    // Networks of LPIPS, such as `lpips_vgg`, share a definition.
+    let is_own = |name: &str| {
+        metric.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('_'))
+    };
+    let (name, text) = conventions.iter().find(|(name, _)| is_own(name))?;
     Some((name, text.as_str()?))
-}
-
-/// True if a metric's name is another one's with a suffix, such as `lpips_vgg`.
-fn is_variant(metric: &str, name: &str) -> bool {
-    metric.strip_prefix(name).is_some_and(|suffix| suffix.starts_with('_'))
 }
 
 /// Text that may be broken after punctuation, so that no word is cut.
@@ -170,8 +167,7 @@ fn missing_note(report: &Report<'_>) -> Markup {
 
 /// Table of every view's figures, readable without mouse and JavaScript, unlike the plots.
 pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
-    let known: Vec<&ScoreFormat> =
-        report.figures.iter().filter(|figure| has_values(figure, &report.rows)).collect();
+    let known = report.known_figures();
     let views: usize = report.rows.iter().map(Row::view_count).sum();
     if views == 0 || views * known.len() > MAX_CELLS {
         return html! {};

@@ -2,8 +2,7 @@
 
 use std::path::PathBuf;
 
-use artifact::{RunNode, RunRecord};
-use scene::Views;
+use artifact::RunRecord;
 
 use crate::gather::views_label;
 
@@ -31,15 +30,9 @@ pub(crate) fn unscored_nodes(run: &RunRecord) -> Vec<usize> {
 }
 
 impl UnscoredViews {
-    /// Reads the names of a node's views; `None` if their list can't be read.
-    pub(crate) fn read_names(run: &RunRecord, index: usize) -> Option<Vec<String>> {
-        let views = Views::read_folder(&run.nodes[index].folder).ok()?;
-        Some(views.views.into_iter().map(|view| view.camera.name).collect())
-    }
-
     /// Describes a node's views; `scene` is the index of their data set.
     pub(crate) fn new(run: &RunRecord, index: usize, scene: usize) -> Self {
-        let node: &RunNode = &run.nodes[index];
+        let node = &run.nodes[index];
         let ancestors = run.ancestors(index).into_iter().map(|index| &run.nodes[index]);
         let scenes = ancestors.filter(|node| node.kind == "scene");
         let mut truths = scenes.map(|node| node.folder.join("truth"));

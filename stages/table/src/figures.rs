@@ -63,11 +63,6 @@ impl Figures {
         }
     }
 
-    /// Returns the column titles of values.
-    pub(crate) fn titles(&self, names: &[&String]) -> Vec<String> {
-        names.iter().map(|name| self.title(name)).collect()
-    }
-
     /// Returns the column title of a value.
     pub(crate) fn title(&self, name: &str) -> String {
         if let Some(figure) = self.0.get(name) {
@@ -113,7 +108,7 @@ mod tests {
             },
             {"path": "blur", "label": "blur ↓", "digits": 3, "higher_is_better": false},
         ]})));
-        assert_eq!(figures.titles(&[&"sharpness.mean".to_owned()]), ["sharpness"]);
+        assert_eq!(figures.title("sharpness.mean"), "sharpness");
         assert_eq!(figures.format("sharpness.mean", 2.34), "2.3");
         assert_eq!(figures.lower_is_better("sharpness.mean"), Some(false));
         assert_eq!(figures.lower_is_better("blur"), Some(true));

@@ -51,7 +51,7 @@ impl Layout<'_> {
 
     fn head(&self, columns: &[Vec<String>], values: &[&String]) -> Vec<String> {
         let mut head = self.keys.clone();
-        let titles = self.figures.titles(values);
+        let titles: Vec<String> = values.iter().map(|name| self.figures.title(name)).collect();
         if self.params.columns.is_empty() {
             head.extend(titles);
         } else {
@@ -142,8 +142,8 @@ impl Layout<'_> {
             for name in values {
                 cells.push(self.cell(name, &selected, self.best(&group, column, name, &all), &all));
             }
-            if let Some(reason) = missing_reason(&selected) {
-                line.push(reason);
+            if !selected.is_empty() && selected.iter().all(|row| row.contains_key(MISSING)) {
+                line.push(listed(&selected, MISSING));
                 if self.params.columns.is_empty() {
                     line.extend(cells.into_iter().skip(1));
                 }
@@ -237,19 +237,12 @@ impl Layout<'_> {
 /// Text of a cell without a value.
 pub(crate) const NO_VALUE: &str = "–";
 
-/// Returns the reason why rows have no values; `None` if some row has values.
-fn missing_reason(rows: &[Row]) -> Option<String> {
-    let are_missing = !rows.is_empty() && rows.iter().all(|row| row.contains_key(MISSING));
-    are_missing.then(|| listed(rows, MISSING))
-}
-
 /// Formats lines as a Markdown table; the first line is the head.
 pub(crate) fn markdown_table(lines: &[Vec<String>]) -> String {
     let rule = vec!["---".to_owned(); lines[0].len()];
-    [&lines[0], &rule].into_iter().chain(&lines[1..]).map(|cells| grid_line(cells)).collect()
-}
-
-fn grid_line(cells: &[String]) -> String {
-    let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
-    format!("| {} |\n", cells.join(" | "))
+    let text = |cells: &Vec<String>| {
+        let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
+        format!("| {} |\n", cells.join(" | "))
+    };
+    [&lines[0], &rule].into_iter().chain(&lines[1..]).map(text).collect()
 }

@@ -38,14 +38,10 @@ impl Stage for Table {
     const ACCEPTS_FAILURES: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![(
-            "run",
-            Input::required(
-                &["run"],
-                "in pipeline.yaml: a block that scores; nerf-sr passes a folder \
-                with its record, run.json",
-            ),
-        )]
+        Input::run(
+            "in pipeline.yaml: a block that scores; nerf-sr passes a folder with its record, \
+            run.json",
+        )
     }
 
     fn output() -> Output {

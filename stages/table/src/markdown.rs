@@ -31,17 +31,15 @@ pub(crate) fn document(
 ) -> Result<Document, Failure> {
     let keys = row_keys(params, rows)?;
     let reference = reference(params, rows)?;
-    check_front(params, rows)?;
+    let numbers = rows.iter().flatten().filter(|(_, value)| value.is_number());
+    let numbers: Vec<&String> = numbers.map(|(name, _)| name).collect();
+    check_names("front", "value", params.front.as_slice(), rows, &numbers)?;
     let is_by_seed = keys == ["seed"];
     let scene = SCENE.to_owned();
     let is_averaged = !keys.contains(&scene) && !params.columns.contains(&scene);
     // A comparison (`relative_to`) has one table, of the means.
-    let mut scenes = if is_averaged && reference.is_none() {
-        distinct(rows, std::slice::from_ref(&scene)).concat()
-    } else {
-        Vec::new()
-    };
-    if scenes.len() < 2 {
+    let mut scenes = distinct(rows, std::slice::from_ref(&scene)).concat();
+    if !is_averaged || reference.is_some() || scenes.len() < 2 {
         scenes.clear();
     }
     let layout = Layout { params, figures, keys, reference };
@@ -85,8 +83,8 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, Failure> {
             known.push(name);
         }
     }
-    check_keys("rows", &params.rows, rows, &known)?;
-    check_keys("columns", &params.columns, rows, &known)?;
+    check_names("rows", "key", &params.rows, rows, &known)?;
+    check_names("columns", "key", &params.columns, rows, &known)?;
     let mut keys = params.rows.clone();
     if keys.is_empty() {
         for name in known {
@@ -103,9 +101,10 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, Failure> {
     Ok(keys)
 }
 
-/// Fails if a parameter names a key that no result has.
-fn check_keys(
+/// Fails if a parameter names a key or value that no result has.
+fn check_names(
     parameter: &str,
+    kind: &str,
     names: &[String],
     rows: &[Row],
     known: &[&String],
@@ -113,21 +112,10 @@ fn check_keys(
     for name in names {
         if !rows.is_empty() && !rows.iter().any(|row| row.contains_key(name)) {
             let known = artifact::known_names(name, known.iter().map(|name| name.as_str()));
-            bail_usage!("parameter {parameter}: no result has a key {name:?}; {known}");
+            bail_usage!("parameter {parameter}: no result has a {kind} {name:?}; {known}");
         }
     }
     Ok(())
-}
-
-/// Fails if no result has the cost of the front.
-fn check_front(params: &Params, rows: &[Row]) -> Result<(), Failure> {
-    let Some(front) = &params.front else { return Ok(()) };
-    if rows.is_empty() || rows.iter().any(|row| row.contains_key(front)) {
-        return Ok(());
-    }
-    let names = rows.iter().flatten().filter(|(_, value)| value.is_number());
-    let known = artifact::known_names(front, names.map(|(name, _)| name.as_str()));
-    bail_usage!("parameter front: no result has a value {front:?}; {known}");
 }
 
 /// Returns the results that others are compared with; none if the run left them out. Fails if they

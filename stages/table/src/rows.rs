@@ -102,23 +102,15 @@ fn scores(node: &RunNode, figures: &mut Figures) -> anyhow::Result<Row> {
         if let (Some(refined), Some(rendered)) = scores {
             found.insert("gain".to_owned(), json!(refined - rendered));
         }
-        return Ok(found);
+    } else if node.kind == "metrics" {
+        let file = AnyMetrics::read(&node.folder)?;
+        figures.add(&file);
+        numbers("", file.mean(), &mut found);
+        numbers("least_gain", file.least_gain(), &mut found);
+        numbers("near_psnr", &file.near_references()["psnr"], &mut found);
+        numbers("near_views", &file.near_references()["views"], &mut found);
+        found.insert("views".to_owned(), json!(file.views().len()));
     }
-    if node.kind != "metrics" {
-        return Ok(found);
-    }
-    let file = AnyMetrics::read(&node.folder)?;
-    figures.add(&file);
-    numbers("", file.mean(), &mut found);
-    let near = file.near_references();
-    for (name, value) in [
-        ("least_gain", file.least_gain()),
-        ("near_psnr", &near["psnr"]),
-        ("near_views", &near["views"]),
-    ] {
-        numbers(name, value, &mut found);
-    }
-    found.insert("views".to_owned(), json!(file.views().len()));
     Ok(found)
 }
 
@@ -147,7 +139,9 @@ fn read<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
 fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     let [trained, rendered] = run.training_and_rendering(index);
     let mut refined = rendered.clone();
-    refined.retain(|&i| !is_from_field(run, i));
+    let is_field = |parent: usize| run.nodes[parent].kind == "field";
+    refined
+        .retain(|&i| !run.nodes[i].inputs.values().any(|input| input.node.is_some_and(is_field)));
     // Not `Iterator::sum`, whose result is -0.0 without elements.
     let [training, rendering, refining] = [&trained, &rendered, &refined]
         .map(|nodes| nodes.iter().fold(0.0, |sum, &i| sum + run.nodes[i].seconds));
@@ -156,10 +150,9 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     let peaks = trained.iter().chain(&rendered).filter_map(|&i| run.nodes[i].peak_memory);
     let peak_memory = peaks.max().unwrap_or(0);
     let mut row = Row::new();
-    for (name, seconds) in [("train_s", training), ("render_s", rendering), ("refine_s", refining)]
-    {
-        row.insert(name.to_owned(), json!(seconds));
-    }
+    row.insert("train_s".to_owned(), json!(training));
+    row.insert("render_s".to_owned(), json!(rendering));
+    row.insert("refine_s".to_owned(), json!(refining));
     if processor.is_finite() {
         row.insert("train_cpu_s".to_owned(), json!(processor));
     }
@@ -191,10 +184,4 @@ fn weights_bytes(folder: &Path) -> anyhow::Result<u64> {
         }
     }
     Ok(bytes)
-}
-
-/// True if a field is an input of a node.
-fn is_from_field(run: &RunRecord, index: usize) -> bool {
-    let mut parents = run.nodes[index].inputs.values().filter_map(|input| input.node);
-    parents.any(|parent| run.nodes[parent].kind == "field")
 }

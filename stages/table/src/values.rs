@@ -43,8 +43,12 @@ pub(crate) fn mean(rows: &[Row], name: &str) -> Option<f64> {
 
 /// Returns the scenes of the rows that have a value; an empty name for rows without a scene.
 pub(crate) fn scenes(rows: &[Row], name: &str) -> Vec<String> {
-    let with: Vec<Row> = rows.iter().filter(|row| row.contains_key(name)).cloned().collect();
-    distinct(&with, &[SCENE.to_owned()]).concat()
+    distinct(&with(rows, name), &[SCENE.to_owned()]).concat()
+}
+
+/// Returns the rows that have an entry of this name.
+fn with(rows: &[Row], name: &str) -> Vec<Row> {
+    rows.iter().filter(|row| row.contains_key(name)).cloned().collect()
 }
 
 /// Returns the difference between the means of a value over two groups of results, each over the
@@ -73,6 +77,5 @@ pub(crate) fn is_key(name: &str, value: &Value) -> bool {
 
 /// Lists the distinct values that rows have under a name.
 pub(crate) fn listed(rows: &[Row], name: &str) -> String {
-    let with: Vec<Row> = rows.iter().filter(|row| row.contains_key(name)).cloned().collect();
-    distinct(&with, &[name.to_owned()]).concat().join(", ")
+    distinct(&with(rows, name), &[name.to_owned()]).concat().join(", ")
 }

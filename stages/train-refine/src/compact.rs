@@ -1,12 +1,12 @@
 use artifact::{bail_bad_input, bail_usage};
 use pixels::psnr_of;
 use refinement::{
-    Network, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer, RefinerTrainingOptions,
-    WEIGHTS_FILE, WarpOptions,
+    Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer, TrainingOptions, WEIGHTS_FILE,
+    WarpOptions,
 };
 use stage::Context;
 
-use crate::examples::{Examples, lr_photographs};
+use crate::examples::{lr_photographs, read_examples, split};
 use crate::params::CompactParams;
 use crate::steps::{ExampleTraining, training_failure};
 use crate::write_refiner_file;
@@ -17,9 +17,9 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         bail_usage!("parameter patch_size: expected an even number, found {}", net.patch_size);
     }
     let photographs = lr_photographs(context)?;
-    let examples =
-        Examples::read(context.input("views")?, context.input("truth")?, photographs.as_ref())?;
-    if net.references_per_view > 0 && examples.training.len() < 2 {
+    let (views, truth) = (context.input("views")?, context.input("truth")?);
+    let (examples, left_out) = split(read_examples(views, truth, photographs.as_ref())?);
+    if net.references_per_view > 0 && examples.len() < 2 {
         bail_bad_input!(
             "input views: references_per_view needs at least three views with an image in input \
             truth"
@@ -31,7 +31,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         guidance: (net.references_per_view > 0).then_some(WarpOptions::default()),
     };
     let refiner = Refiner::new(architecture, seed);
-    let options = RefinerTrainingOptions {
+    let options = TrainingOptions {
         steps: net.steps,
         batch_size: net.batch_size as usize,
         patch_size: net.patch_size as usize,
@@ -40,20 +40,13 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         seed,
     };
     let trainer = RefinerTrainer::new(refiner, options);
-    let mut training = ExampleTraining { trainer, examples: &examples.training };
+    let mut training = ExampleTraining { trainer, examples: &examples };
     context.train(options.steps, &mut training, |loss| {
         format!("PSNR of training patches {:.2} dB", psnr_of(loss))
     })?;
     let trainer = training.trainer;
-    let scores = trainer.score(&examples.left_out, &examples.training)?;
+    let file = trainer.score(&left_out, &examples)?;
     trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?).map_err(training_failure)?;
-    let file = RefinerFile {
-        network: Network::Compact(architecture),
-        residual_weight: scores.residual_weight,
-        rendered_psnr: scores.rendered_psnr,
-        refined_psnr: scores.refined_psnr,
-        confidence: scores.confidence,
-        data_consistent: photographs.is_some(),
-    };
+    let file = RefinerFile { data_consistent: photographs.is_some(), ..file };
     write_refiner_file(context, "views left out of training", &file)
 }

@@ -1,97 +1,56 @@
 use artifact::{Failure, FailureExt as _, GivenInput, bail_bad_input};
 use refinement::{KnownView, LrObservations, Rendered};
-use scene::{View, Views};
+use scene::Views;
 use stage::Context;
 
 /// Interval of the views that are left out of training (design note 015).
 const HOLD_OUT_EVERY: usize = 8;
 
-/// Views with ground truth.
-#[derive(Debug)]
-pub(crate) struct Examples<T = KnownView> {
-    /// Views to train on.
-    pub(crate) training: Vec<T>,
-    /// Views to score the network on.
-    pub(crate) left_out: Vec<T>,
-}
-
-impl<T: Clone> Examples<T> {
-    /// Leaves out the fifth of each eight views, or the last of fewer than five; a single view is
-    /// used for both.
-    fn split(all: Vec<T>) -> Self {
-        if all.len() == 1 {
-            return Self { training: all.clone(), left_out: all };
-        }
-        let middle = (HOLD_OUT_EVERY / 2).min(all.len() - 1);
-        let mut examples = Self { training: Vec::new(), left_out: Vec::new() };
-        for (i, example) in all.into_iter().enumerate() {
-            let is_left_out = i % HOLD_OUT_EVERY == middle;
-            if is_left_out { &mut examples.left_out } else { &mut examples.training }.push(example);
-        }
-        examples
+/// Splits examples into those to train on and those to score the network on: the fifth of each eight,
+/// or the last of fewer than five. A single example is used for both.
+pub(crate) fn split<T: Clone>(all: Vec<T>) -> (Vec<T>, Vec<T>) {
+    if all.len() == 1 {
+        return (all.clone(), all);
     }
-}
-
-impl Examples {
-    /// Reads views like [`Examples::read_all`], and leaves out some of them.
-    pub(crate) fn read(
-        views: &GivenInput,
-        truth: &GivenInput,
-        photographs: Option<&LrObservations<'_>>,
-    ) -> Result<Self, Failure> {
-        Ok(Self::split(Self::read_all(views, truth, photographs)?))
+    let middle = (HOLD_OUT_EVERY / 2).min(all.len() - 1);
+    let (mut training, mut left_out) = (Vec::new(), Vec::new());
+    for (i, example) in all.into_iter().enumerate() {
+        let is_left_out = i % HOLD_OUT_EVERY == middle;
+        if is_left_out { &mut left_out } else { &mut training }.push(example);
     }
-
-    /// Reads rendered views and their truth, and makes the views consistent with LR `photographs`
-    /// if given.
-    pub(crate) fn read_all(
-        views: &GivenInput,
-        truth: &GivenInput,
-        photographs: Option<&LrObservations<'_>>,
-    ) -> Result<Vec<KnownView>, Failure> {
-        let true_views = Views::read(truth)?;
-        let background = true_views.background.grey_level();
-        let sources = Sources { views, truth, photographs, background };
-        let mut all = Vec::new();
-        for view in &Views::read(views)?.views {
-            if let Some(true_view) = true_views.taken_by(&view.camera) {
-                all.extend(sources.read(view, true_view)?);
-            }
-        }
-        if all.is_empty() {
-            bail_bad_input!(
-                "input views: no view has an image in input truth with the same name and pose"
-            );
-        }
-        Ok(all)
-    }
+    (training, left_out)
 }
 
-/// Inputs of the examples.
-struct Sources<'a> {
-    views: &'a GivenInput,
-    truth: &'a GivenInput,
-    photographs: Option<&'a LrObservations<'a>>,
-    background: f32,
-}
-
-impl Sources<'_> {
-    /// Reads a view and its truth; `None` if one of them has no image.
-    fn read(&self, view: &View, true_view: &View) -> Result<Option<KnownView>, Failure> {
-        let truth = true_view
-            .read_photograph(self.truth)
-            .bad_input(format!("view {}", view.camera.name))?;
-        let Some(truth) = truth else { return Ok(None) };
-        let Some((mut rendered, _)) = Rendered::read(self.views, view, self.background, true)?
-        else {
-            return Ok(None);
+/// Reads rendered views and their truth, and makes the views consistent with LR `photographs` if
+/// given. Views without an image, or without one in their truth, are skipped.
+pub(crate) fn read_examples(
+    views: &GivenInput,
+    truth: &GivenInput,
+    photographs: Option<&LrObservations<'_>>,
+) -> Result<Vec<KnownView>, Failure> {
+    let true_views = Views::read(truth)?;
+    let background = true_views.background.grey_level();
+    let mut all = Vec::new();
+    for view in &Views::read(views)?.views {
+        let Some(true_view) = true_views.taken_by(&view.camera) else { continue };
+        let photograph = true_view.read_photograph(truth);
+        let photograph = photograph.bad_input(format!("view {}", view.camera.name))?;
+        let Some(photograph) = photograph else { continue };
+        let Some((mut rendered, _)) = Rendered::read(views, view, background, true)? else {
+            continue;
         };
-        if let Some(photographs) = self.photographs {
+        if let Some(photographs) = photographs {
             rendered = photographs.make_consistent(rendered)?;
         }
-        let known = KnownView::new(rendered, truth.over(self.background));
-        Ok(Some(known.bad_input("input views")?))
+        let known = KnownView::new(rendered, photograph.over(background));
+        all.push(known.bad_input("input views")?);
     }
+    if all.is_empty() {
+        bail_bad_input!(
+            "input views: no view has an image in input truth with the same name and pose"
+        );
+    }
+    Ok(all)
 }
 
 /// Reads the LR photographs of the downscaled field's views, if the views to be refined will have
@@ -119,7 +78,7 @@ mod tests {
 
     use pixels::{Image, write_png};
     use scene::{
-        Background, Bounds, Camera, Intrinsics, VIEW_CHANNELS, VIEWS_FILE, write_view_image,
+        Background, Bounds, Camera, Intrinsics, VIEW_CHANNELS, VIEWS_FILE, View, write_view_image,
     };
 
     use super::*;
@@ -185,9 +144,9 @@ mod tests {
         ];
         let [views, truth] = [("views", views), ("truth", truth)]
             .map(|(name, views)| write_input(dir.path(), name, views));
-        let Examples { training, left_out } = Examples::read(&views, &truth, None).unwrap();
-        assert_eq!((training.len(), left_out.len()), (1, 1));
-        let KnownView { rendered, truth } = &training[0];
+        let examples = read_examples(&views, &truth, None).unwrap();
+        assert_eq!(examples.len(), 1);
+        let KnownView { rendered, truth } = &examples[0];
         assert_eq!(rendered.camera.name, "whole");
         // Composited over white.
         assert_eq!(rendered.colours().data, [0.75; 3 * SIDE * SIDE]);
@@ -201,7 +160,7 @@ mod tests {
         let [views, truth] = [("views", "one"), ("truth", "other")].map(|(input_name, name)| {
             write_input(dir.path(), input_name, vec![view(name, 0.0, None)])
         });
-        let Err(Failure::BadInput(message)) = Examples::read(&views, &truth, None) else {
+        let Err(Failure::BadInput(message)) = read_examples(&views, &truth, None) else {
             panic!("views without ground truth are accepted");
         };
         assert!(message.starts_with("input views: no view has an image"), "{message}");
@@ -210,19 +169,18 @@ mod tests {
     #[test]
     fn every_eighth_is_left_out_and_none_is_lost() {
         for count in 2..40usize {
-            let Examples { training, left_out } = Examples::split((0..count).collect());
+            let (training, left_out) = split((0..count).collect());
             let mut all = [training.clone(), left_out.clone()].concat();
             all.sort_unstable();
             assert_eq!(all, (0..count).collect::<Vec<_>>(), "{count}");
             assert!(!training.is_empty() && !left_out.is_empty(), "{count}");
             assert!(left_out.len() <= count.div_ceil(HOLD_OUT_EVERY), "{count}: {left_out:?}");
         }
-        assert_eq!(Examples::split((0..16).collect::<Vec<_>>()).left_out, [4, 12]);
+        assert_eq!(split((0..16).collect::<Vec<_>>()).1, [4, 12]);
     }
 
     #[test]
     fn a_single_example_is_trained_on_and_left_out() {
-        let Examples { training, left_out } = Examples::split(vec![7]);
-        assert_eq!((training, left_out), (vec![7], vec![7]));
+        assert_eq!(split(vec![7]), (vec![7], vec![7]));
     }
 }

@@ -1,11 +1,10 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
-use pixels::{Image, psnr_of};
-use refinement::paper::{PaperRefiner, PaperTrainer, PaperTrainingOptions, PerceptualLoss};
-use refinement::{Network, RefinerFile, WEIGHTS_FILE};
+use refinement::paper::{PaperRefiner, PaperTrainer, PerceptualLoss};
+use refinement::{Network, RefinerFile, TrainingOptions, WEIGHTS_FILE};
 use serde_json::json;
 use stage::{Context, Rule};
 
-use crate::examples::Examples;
+use crate::examples::read_examples;
 use crate::params::PaperParams;
 use crate::steps::{ExampleTraining, training_failure};
 use crate::write_refiner_file;
@@ -16,8 +15,8 @@ const VGG_FILES: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetens
 
 /// Trains the published network on all given views; the publication uses one.
 pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow::Result<()> {
-    let known = Examples::read_all(context.input("views")?, context.input("truth")?, None)?;
-    let options = PaperTrainingOptions {
+    let known = read_examples(context.input("views")?, context.input("truth")?, None)?;
+    let options = TrainingOptions {
         steps: params.steps,
         batch_size: params.batch_size as usize,
         patch_size: params.patch_size as usize,
@@ -25,7 +24,7 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
         learning_rate: params.learning_rate,
         seed,
     };
-    options.check(&known).bad_input("cannot train on input truth")?;
+    PaperTrainer::check(&options, &known).bad_input("cannot train on input truth")?;
     let perceptual = context.optional_input("weights").map(read_perceptual_loss).transpose()?;
     context.log_line(match &perceptual {
         Some(loss) => {
@@ -45,12 +44,11 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     let share = 1.0 / known.len() as f64;
     for view in &known {
         let redrawn = trainer.network().refine(&view.rendered, &[view], options.references)?;
-        rendered += share * psnr(&view.rendered.colours(), &view.truth);
-        refined += share * psnr(&redrawn, &view.truth);
+        rendered += share * view.psnr(&view.rendered.colours());
+        refined += share * view.psnr(&redrawn);
     }
-    let network = Network::Paper { width, patches: params.patches };
     let file = RefinerFile {
-        network,
+        network: Network::Paper { width, patches: params.patches },
         residual_weight: 1.0,
         rendered_psnr: rendered,
         refined_psnr: refined,
@@ -72,10 +70,4 @@ fn read_perceptual_loss(input: &GivenInput) -> Result<PerceptualLoss, Failure> {
     let file = VGG_FILES.iter().map(|name| input.path(name)).find(|path| path.is_file());
     let file = file.unwrap_or_else(|| input.path(VGG_FILES[0]));
     PerceptualLoss::read(&file).bad_input("input weights")
-}
-
-/// Returns the PSNR of two images of one size in dB.
-fn psnr(image: &Image, truth: &Image) -> f64 {
-    let squares = image.data.iter().zip(&truth.data).map(|(a, b)| f64::from(a - b).powi(2));
-    psnr_of(squares.sum::<f64>() / truth.data.len() as f64)
 }

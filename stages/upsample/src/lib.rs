@@ -20,7 +20,7 @@ mod network;
 mod swinir;
 
 use anyhow::Context as _;
-use artifact::{Failure, FailureExt as _, GivenInput};
+use artifact::{Failure, FailureExt as _, GivenInput, bail_bad_input, bail_usage};
 use nets::Weights;
 use pixels::{Filter, Image, Mask, resize_pillow, write_png};
 use rayon::prelude::*;
@@ -234,45 +234,37 @@ fn read_networks(
     let networks = networks.bad_input("input weights")?;
     let network_scale = networks.first().and_then(|n| n.as_ref()?.scale());
     for (view, camera) in pairs {
-        let [lr, hr] = [&view.camera, *camera]
+        let sizes = [&view.camera, *camera]
             .map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
-        check_scale(network_scale, lr, hr)
+        check_scale(network_scale, sizes)
             .map_err(|e| Failure::BadInput(format!("view {}: {file} {e}", camera.name)))?;
     }
     Ok(networks)
 }
 
-/// Error returned when a network's scale doesn't map the LR size to the HR size.
-#[derive(Debug, thiserror::Error)]
-#[error(
-    "enlarges {scale} times, but the camera has {}×{} pixels and the view {}×{}; use views of \
-    another size, or method bicubic or liif",
-    hr[0], hr[1], lr[0], lr[1]
-)]
-struct WrongScale {
-    scale: i64,
-    lr: [i64; 2],
-    hr: [i64; 2],
-}
-
-/// Checks that a network's scale, if it has one, maps the LR size to the HR size.
-fn check_scale(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), WrongScale> {
-    match scale {
-        Some(scale) if lr.map(|size| size * scale) != hr => Err(WrongScale { scale, lr, hr }),
-        _ => Ok(()),
-    }
+/// Fails if a network's scale, if it has one, doesn't map the LR size to the HR size.
+fn check_scale(scale: Option<i64>, [lr, hr]: [[i64; 2]; 2]) -> anyhow::Result<()> {
+    let Some(scale) = scale.filter(|scale| lr.map(|size| size * scale) != hr) else {
+        return Ok(());
+    };
+    anyhow::bail!(
+        "enlarges {scale} times, but the camera has {}×{} pixels and the view {}×{}; use views of \
+        another size, or method bicubic or liif",
+        hr[0],
+        hr[1],
+        lr[0],
+        lr[1]
+    )
 }
 
 /// Reads the network's tensors from a file of this name in the input.
 fn read_weights(input: &GivenInput, file: &str) -> Result<Weights, Failure> {
     if std::path::Path::new(file).file_name().is_none_or(|name| name != file) {
-        return Err(Failure::Usage(format!(
-            "parameter file: {file:?} is not the name of a file in input weights"
-        )));
+        bail_usage!("parameter file: {file:?} is not the name of a file in input weights");
     }
     let path = input.path(file);
     if !path.is_file() {
-        return Err(Failure::BadInput(format!("input weights: no file {file}; {REMEDY}")));
+        bail_bad_input!("input weights: no file {file}; {REMEDY}");
     }
     Weights::read(&path).bad_input("input weights")
 }

@@ -1,5 +1,5 @@
-use nets::{Conv, Weights, WeightsError};
-use tch::{TchError, Tensor};
+use nets::{Conv, Device, Weights, WeightsError};
+use tch::{Kind, TchError, Tensor};
 
 use crate::network::{Linear, Network, count_parts};
 
@@ -163,7 +163,7 @@ impl Network for Liif {
         let mut chunks = Vec::new();
         for start in (0..(rows * columns) as usize).step_by(CHUNK_PIXELS) {
             let pixels = start..(start + CHUNK_PIXELS).min((rows * columns) as usize);
-            let mut sum = None::<Tensor>;
+            let mut sum = Tensor::f_zeros([pixels.len() as i64, 3], (Kind::Float, Device::Cpu))?;
             for (v, h) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
                 let (mut indices, mut offsets, mut weights) = (Vec::new(), Vec::new(), Vec::new());
                 for pixel in pixels.clone() {
@@ -180,13 +180,10 @@ impl Network for Liif {
                 for layer in others {
                     x = layer.forward(&x.f_relu()?)?;
                 }
-                let weighted = x.f_mul(&Tensor::f_from_slice(&weights)?.f_unsqueeze(1)?)?;
-                sum = Some(match sum {
-                    Some(sum) => sum.f_add(&weighted)?,
-                    None => weighted,
-                });
+                let weights = Tensor::f_from_slice(&weights)?.f_unsqueeze(1)?;
+                sum = sum.f_add(&x.f_mul(&weights)?)?;
             }
-            chunks.extend(sum);
+            chunks.push(sum);
         }
         let colours =
             Tensor::f_cat(&chunks, 0)?.f_transpose(0, 1)?.f_reshape([1, 3, rows, columns])?;

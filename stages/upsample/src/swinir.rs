@@ -11,8 +11,9 @@ pub(crate) struct SwinIr {
     embedded: Option<LayerNorm>,
     groups: Vec<Group>,
     norm: LayerNorm,
-    after: Convs,
-    head: Head,
+    after: Vec<Layer>,
+    /// Layers from features to the enlarged image.
+    head: Vec<Layer>,
     /// Side of an attention window in pixels.
     window: i64,
     scale: i64,
@@ -31,20 +32,19 @@ const MASKED_BIAS: f32 = -100.0;
 /// Transformer blocks followed by a convolution.
 struct Group {
     blocks: Vec<TransformerBlock>,
-    after: Convs,
+    after: Vec<Layer>,
 }
 
-/// One convolution, or a bottleneck of three.
-struct Convs(Vec<Conv>);
-
-/// Layers from features to the enlarged image.
-enum Head {
-    /// Pixel shuffle in one or several steps, each with its scale; the classical models.
-    PixelShuffle { before: Conv, steps: Vec<(Conv, i64)>, last: Conv },
-    /// Pixel shuffle directly to colours; the lightweight models.
-    Direct { up: Conv, scale: i64 },
-    /// Nearest-neighbour enlargement and convolution; the real-world models.
-    NearestConv { before: Conv, steps: Vec<Conv>, hr: Conv, last: Conv },
+/// Layer without attention.
+enum Layer {
+    /// Convolution and its padding.
+    Conv(Conv, i64),
+    /// Leaky ReLU and its negative slope.
+    LeakyRelu(f64),
+    /// Pixel shuffle by a factor.
+    PixelShuffle(i64),
+    /// Enlargement by 2 to nearest neighbours.
+    Nearest,
 }
 
 /// Attention within windows, then an MLP of two layers, both with residual connections.
@@ -68,7 +68,7 @@ impl SwinIr {
         let window = ((integer_root(weights.shape::<2>(table)?[0]) + 1) / 2).max(1);
         let groups =
             count_parts(weights, 0, |i| format!("layers.{i}.residual_group.blocks.0.norm1.weight"));
-        let (head, scale) = Head::read(weights, width)?;
+        let (head, scale) = read_head(weights, width)?;
         let embedded = weights
             .has("patch_embed.norm.weight")
             .then(|| LayerNorm::read(weights, "patch_embed.norm", width));
@@ -79,7 +79,7 @@ impl SwinIr {
                 .map(|i| Group::read(weights, i, width, window))
                 .collect::<Result<_, _>>()?,
             norm: LayerNorm::read(weights, "norm", width)?,
-            after: Convs::read(weights, "conv_after_body", width)?,
+            after: read_convs(weights, "conv_after_body", width)?,
             head,
             window,
             scale,
@@ -107,9 +107,9 @@ impl Network for SwinIr {
         for group in &self.groups {
             x = group.forward(&x, self.window, &mask)?;
         }
-        let deep =
-            self.after.forward(&self.norm.forward(&x)?.f_permute([0, 3, 1, 2])?)?.f_add(&first)?;
-        let hr = self.head.forward(&deep)?.f_add(&mean)?;
+        let normalised = self.norm.forward(&x)?.f_permute([0, 3, 1, 2])?;
+        let deep = apply(&self.after, normalised)?.f_add(&first)?;
+        let hr = apply(&self.head, deep)?.f_add(&mean)?;
         hr.f_narrow(2, 0, rows * self.scale)?.f_narrow(3, 0, columns * self.scale)
     }
 }
@@ -150,7 +150,7 @@ impl Group {
         });
         Ok(Self {
             blocks: blocks.collect::<Result<_, _>>()?,
-            after: Convs::read(weights, &format!("layers.{index}.conv"), width)?,
+            after: read_convs(weights, &format!("layers.{index}.conv"), width)?,
         })
     }
 
@@ -159,87 +159,76 @@ impl Group {
         for block in &self.blocks {
             inner = block.forward(&inner, window, mask)?;
         }
-        self.after.forward(&inner.f_permute([0, 3, 1, 2])?)?.f_permute([0, 2, 3, 1])?.f_add(x)
+        apply(&self.after, inner.f_permute([0, 3, 1, 2])?)?.f_permute([0, 2, 3, 1])?.f_add(x)
     }
 }
 
-impl Convs {
-    fn read(weights: &Weights, name: &str, width: i64) -> Result<Self, WeightsError> {
-        if weights.has(&format!("{name}.weight")) {
-            return Ok(Self(vec![Conv::read(weights, name, [width, width, 3, 3])?]));
-        }
-        let narrow = width / 4;
-        Ok(Self(vec![
-            Conv::read(weights, &format!("{name}.0"), [narrow, width, 3, 3])?,
-            Conv::read(weights, &format!("{name}.2"), [narrow, narrow, 1, 1])?,
-            Conv::read(weights, &format!("{name}.4"), [width, narrow, 3, 3])?,
-        ]))
+/// Reads one convolution, or a bottleneck of three.
+fn read_convs(weights: &Weights, name: &str, width: i64) -> Result<Vec<Layer>, WeightsError> {
+    if weights.has(&format!("{name}.weight")) {
+        return Ok(vec![Layer::Conv(Conv::read(weights, name, [width, width, 3, 3])?, 1)]);
     }
-
-    fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        match &self.0[..] {
-            [one, two, three] => {
-                let inner = leaky_relu(&one.forward(x, 1, 1)?, SLOPE)?;
-                three.forward(&leaky_relu(&two.forward(&inner, 1, 0)?, SLOPE)?, 1, 1)
-            }
-            convs => convs[0].forward(x, 1, 1),
-        }
-    }
+    let narrow = width / 4;
+    let conv = |i: usize, shape| Conv::read(weights, &format!("{name}.{i}"), shape);
+    Ok(vec![
+        Layer::Conv(conv(0, [narrow, width, 3, 3])?, 1),
+        Layer::LeakyRelu(SLOPE),
+        Layer::Conv(conv(2, [narrow, narrow, 1, 1])?, 0),
+        Layer::LeakyRelu(SLOPE),
+        Layer::Conv(conv(4, [width, narrow, 3, 3])?, 1),
+    ])
 }
 
-impl Head {
-    /// Reads the head of the kind that the file has; returns it with its scale.
-    fn read(weights: &Weights, width: i64) -> Result<(Self, i64), WeightsError> {
-        let conv = |name: &str, outputs, inputs| Conv::read(weights, name, [outputs, inputs, 3, 3]);
-        if !weights.has("conv_before_upsample.0.weight") {
-            let scale = integer_root(weights.shape::<4>("upsample.0.weight")?[0] / 3);
-            let up = conv("upsample.0", 3 * scale * scale, width)?;
-            return Ok((Self::Direct { up, scale }, scale));
+/// Reads the head of the kind that the file has, and its scale: pixel shuffle directly to colours
+/// (the lightweight models), in one or several steps (the classical ones), or enlargement to nearest
+/// neighbours and convolution (the real-world ones).
+fn read_head(weights: &Weights, width: i64) -> Result<(Vec<Layer>, i64), WeightsError> {
+    let conv = |name: &str, outputs, inputs| {
+        Ok::<_, WeightsError>(Layer::Conv(Conv::read(weights, name, [outputs, inputs, 3, 3])?, 1))
+    };
+    if !weights.has("conv_before_upsample.0.weight") {
+        let scale = integer_root(weights.shape::<4>("upsample.0.weight")?[0] / 3);
+        let up = conv("upsample.0", 3 * scale * scale, width)?;
+        return Ok((vec![up, Layer::PixelShuffle(scale)], scale));
+    }
+    let [middle, ..] = weights.shape::<4>("conv_before_upsample.0.weight")?;
+    let mut scale = 1;
+    let mut layers =
+        vec![conv("conv_before_upsample.0", middle, width)?, Layer::LeakyRelu(HEAD_SLOPE)];
+    if weights.has("conv_up1.weight") {
+        for i in 1..=count_parts(weights, 1, |i| format!("conv_up{i}.weight")) {
+            let up = conv(&format!("conv_up{i}"), middle, middle)?;
+            layers.extend([Layer::Nearest, up, Layer::LeakyRelu(SLOPE)]);
+            scale = 1 << i.min(8);
         }
-        let [middle, ..] = weights.shape::<4>("conv_before_upsample.0.weight")?;
-        let before = conv("conv_before_upsample.0", middle, width)?;
-        let last = conv("conv_last", 3, middle)?;
-        if weights.has("conv_up1.weight") {
-            let count = count_parts(weights, 1, |i| format!("conv_up{i}.weight"));
-            let steps = (1..=count)
-                .map(|i| conv(&format!("conv_up{i}"), middle, middle))
-                .collect::<Result<Vec<_>, _>>()?;
-            let hr = conv("conv_hr", middle, middle)?;
-            return Ok((Self::NearestConv { before, steps, hr, last }, 1 << count.min(8)));
-        }
-        let (mut scale, mut steps) = (1, Vec::new());
+        layers.extend([conv("conv_hr", middle, middle)?, Layer::LeakyRelu(SLOPE)]);
+    } else {
         for i in 0..count_parts(weights, 0, |i| format!("upsample.{}.weight", 2 * i)) {
             let name = format!("upsample.{}", 2 * i);
-            let factor =
-                integer_root(weights.shape::<4>(&format!("{name}.weight"))?[0] / middle.max(1));
-            steps.push((conv(&name, factor * factor * middle, middle)?, factor));
+            let outputs = weights.shape::<4>(&format!("{name}.weight"))?[0];
+            let factor = integer_root(outputs / middle.max(1));
+            let up = conv(&name, factor * factor * middle, middle)?;
+            layers.extend([up, Layer::PixelShuffle(factor)]);
             scale *= factor;
         }
-        Ok((Self::PixelShuffle { before, steps, last }, scale))
     }
+    layers.push(conv("conv_last", 3, middle)?);
+    Ok((layers, scale))
+}
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        match self {
-            Self::Direct { up, scale } => up.forward(x, 1, 1)?.f_pixel_shuffle(*scale),
-            Self::PixelShuffle { before, steps, last } => {
-                let mut x = leaky_relu(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
-                for (conv, factor) in steps {
-                    x = conv.forward(&x, 1, 1)?.f_pixel_shuffle(*factor)?;
-                }
-                last.forward(&x, 1, 1)
-            }
-            Self::NearestConv { before, steps, hr, last } => {
-                let mut x = leaky_relu(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
-                for conv in steps {
-                    let repeated = x
-                        .f_repeat_interleave_self_int(2, 2, None)?
-                        .f_repeat_interleave_self_int(2, 3, None)?;
-                    x = leaky_relu(&conv.forward(&repeated, 1, 1)?, SLOPE)?;
-                }
-                last.forward(&leaky_relu(&hr.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
-            }
-        }
+/// Applies layers in order.
+fn apply(layers: &[Layer], mut x: Tensor) -> Result<Tensor, TchError> {
+    for layer in layers {
+        x = match layer {
+            Layer::Conv(conv, padding) => conv.forward(&x, 1, *padding)?,
+            Layer::LeakyRelu(slope) => leaky_relu(&x, *slope)?,
+            Layer::PixelShuffle(factor) => x.f_pixel_shuffle(*factor)?,
+            Layer::Nearest => x
+                .f_repeat_interleave_self_int(2, 2, None)?
+                .f_repeat_interleave_self_int(2, 3, None)?,
+        };
     }
+    Ok(x)
 }
 
 impl TransformerBlock {

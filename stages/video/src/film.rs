@@ -1,6 +1,7 @@
 //! Films of frames: MP4 by ffmpeg, otherwise an animated PNG.
 
-use std::io::{self, BufRead, BufReader, Read as _};
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, BufWriter, Read as _};
 use std::path::{Path, PathBuf};
 use std::process::{self, Command, Stdio};
 use std::time::Duration;
@@ -8,8 +9,6 @@ use std::time::Duration;
 use anyhow::Context as _;
 use pixels::{Filter, read_png, resize_pillow};
 use stage::{Context, Progress};
-
-use crate::animation::AnimatedPng;
 
 /// Interval at which ffmpeg and interruptions are checked; chosen by hand.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
@@ -98,14 +97,35 @@ impl Film<'_> {
                 Some(animation) => animation,
                 None => {
                     let frames = self.frames.div_ceil(step) as u32;
-                    animation.insert(AnimatedPng::create(&path, (width, height), frames, rate)?)
+                    animation.insert(create_animation(&path, (width, height), frames, rate)?)
                 }
             };
-            animation.add(&frame)?;
+            let pixels = frame.data.chunks_exact(4);
+            let rgb: Vec<u8> = pixels.flat_map(|p| [p[0], p[1], p[2]]).collect();
+            animation.write_image_data(&rgb)?;
             progress.set(index as u64, "");
         }
-        animation.map_or(Ok(()), AnimatedPng::finish)
+        Ok(animation.map_or(Ok(()), png::Writer::finish)?)
     }
+}
+
+/// Creates an animated PNG of opaque frames, which repeats forever, with the given number of frames,
+/// at `rate` frames per second, at most 600.
+fn create_animation(
+    path: &Path,
+    (width, height): (usize, usize),
+    frames: u32,
+    rate: f64,
+) -> anyhow::Result<png::Writer<BufWriter<File>>> {
+    let file = BufWriter::new(File::create(path)?);
+    let mut encoder = png::Encoder::new(file, width as u32, height as u32);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_compression(png::Compression::Balanced);
+    encoder.set_animated(frames, 0)?;
+    // In hundredths, so that rates of films, such as 29.97, are exact.
+    encoder.set_frame_delay(100, (100.0 * rate).round().max(1.0) as u16)?;
+    Ok(encoder.write_header()?)
 }
 
 /// Runs ffmpeg and collects its stderr; kills ffmpeg if the stage is interrupted. `progress` gets
@@ -152,6 +172,28 @@ fn encoded_frames(line: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn frames_and_their_times_are_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("video.png");
+        let mut animation = create_animation(&path, (3, 2), 2, 15.0).unwrap();
+        for level in [10, 20] {
+            animation.write_image_data(&[level; 18]).unwrap();
+        }
+        animation.finish().unwrap();
+        let file = BufReader::new(File::open(&path).unwrap());
+        let mut reader = png::Decoder::new(file).read_info().unwrap();
+        for level in [10, 20] {
+            let mut data = vec![0; 18];
+            reader.next_frame(&mut data).unwrap();
+            assert_eq!(data, [level; 18]);
+            let frame = reader.info().frame_control.unwrap();
+            assert_eq!((frame.delay_num, frame.delay_den), (100, 1500));
+        }
+        let frames = reader.info().animation_control.unwrap();
+        assert_eq!((frames.num_frames, frames.num_plays), (2, 0));
+    }
 
     #[test]
     fn frame_counts_of_ffmpeg_are_read() {

@@ -3,7 +3,6 @@
 //! The stage is a sink. It writes a PNG per frame and a film: `video.mp4` by `ffmpeg`, or
 //! `video.png` if `ffmpeg` is missing or fails. Each point of a sweep has its own folder.
 
-mod animation;
 mod film;
 
 use std::path::Path;
@@ -57,14 +56,10 @@ impl Stage for Video {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![(
-            "run",
-            Input::required(
-                &["run"],
-                "in pipeline.yaml: a block that renders views; nerf-sr passes a folder \
-                with its record, run.json",
-            ),
-        )]
+        Input::run(
+            "in pipeline.yaml: a block that renders views; nerf-sr passes a folder with its \
+            record, run.json",
+        )
     }
 
     fn output() -> Output {
@@ -117,7 +112,8 @@ fn make_film(
     rate: f64,
 ) -> anyhow::Result<()> {
     let views = Views::read_folder(folder)?;
-    if views.views.iter().any(|view| size_of_view(view) != size_of_view(&views.views[0])) {
+    let size = |view: &View| [view.camera.intrinsics.width, view.camera.intrinsics.height];
+    if views.views.iter().any(|view| size(view) != size(&views.views[0])) {
         bail_bad_input!("views have different sizes; set render-depth.size");
     }
     let progress = context.progress("drawing", 2 * views.views.len() as u64);
@@ -133,66 +129,54 @@ fn make_film(
     let film = Film { prefix, frames: views.views.len(), rate };
     views.views.par_iter().enumerate().try_for_each(|(i, view)| {
         context.check_interrupt()?;
-        let frame = draw_frame(&views, view, folder, range)?;
-        write_png(&film.frame_path(context, &format!("{i:05}"))?, &with_even_size(&frame))?;
+        let frame = side_by_side(&draw_frame(&views, view, folder, range)?);
+        write_png(&film.frame_path(context, &format!("{i:05}"))?, &frame)?;
         progress.add(1);
         anyhow::Ok(())
     })?;
     film.write(context)
 }
 
-fn size_of_view(view: &View) -> (u32, u32) {
-    (view.camera.intrinsics.width, view.camera.intrinsics.height)
-}
-
-/// Draws a view's colour and, with a range of depths, its depth on the right.
+/// Draws a view's colour and, with a range of depths, its depth.
 fn draw_frame(
     views: &Views,
     view: &View,
     folder: &Path,
     range: Option<(f32, f32)>,
-) -> anyhow::Result<Rgba8> {
+) -> anyhow::Result<Vec<Rgba8>> {
     let image = view.image.as_ref();
     let image = image.with_context(|| format!("view {} has no image", view.camera.name))?;
     let colour = views.read_over(&folder.join(image))?.to_rgba8();
-    let (Some(file), Some(range)) = (&view.depth, range) else { return Ok(colour) };
+    let (Some(file), Some(range)) = (&view.depth, range) else { return Ok(vec![colour]) };
     let image = read_exr(&folder.join(file))?;
-    Ok(match DepthMap::of(&image) {
-        Some(map) if image.height == colour.height => {
-            side_by_side(&colour, &map.draw(image.width, range))
-        }
-        Some(_) => bail_bad_input!(
+    let Some(map) = DepthMap::of(&image) else { return Ok(vec![colour]) };
+    if image.height != colour.height {
+        bail_bad_input!(
             "view {}: image and depth have different heights, {} and {} pixels",
             view.camera.name,
             colour.height,
             image.height
-        ),
-        None => colour,
-    })
-}
-
-/// Joins two images of equal height.
-fn side_by_side(left: &Rgba8, right: &Rgba8) -> Rgba8 {
-    let mut data = Vec::with_capacity(left.data.len() + right.data.len());
-    let right_rows = right.data.chunks_exact(4 * right.width);
-    for (left_row, right_row) in left.data.chunks_exact(4 * left.width).zip(right_rows) {
-        data.extend_from_slice(left_row);
-        data.extend_from_slice(right_row);
+        );
     }
-    Rgba8::new(left.width + right.width, left.height, data)
+    let depth = map.draw(image.width, range);
+    Ok(vec![colour, depth])
 }
 
-/// Repeats the last column and row of an image with odd sizes, which yuv420p doesn't allow.
-fn with_even_size(image: &Rgba8) -> Rgba8 {
-    let (width, height) = (image.width.next_multiple_of(2), image.height.next_multiple_of(2));
-    let mut data = Vec::with_capacity(4 * width * height);
-    for y in 0..height {
-        for x in 0..width {
-            let pixel = y.min(image.height - 1) * image.width + x.min(image.width - 1);
-            data.extend_from_slice(&image.data[4 * pixel..4 * (pixel + 1)]);
+/// Joins images of equal height side by side. Repeats the last column and row of odd sizes, which
+/// yuv420p doesn't allow.
+fn side_by_side(images: &[Rgba8]) -> Rgba8 {
+    let width: usize = images.iter().map(|image| image.width).sum();
+    let mut data = Vec::new();
+    for y in 0..images[0].height.next_multiple_of(2) {
+        for image in images {
+            let row = y.min(image.height - 1) * image.width;
+            data.extend_from_slice(&image.data[4 * row..4 * (row + image.width)]);
+        }
+        if width % 2 == 1 {
+            data.extend_from_within(data.len() - 4..);
         }
     }
-    Rgba8::new(width, height, data)
+    Rgba8::new(width.next_multiple_of(2), images[0].height.next_multiple_of(2), data)
 }
 
 #[cfg(test)]
@@ -202,7 +186,7 @@ mod tests {
     #[test]
     fn frames_have_even_sizes_and_both_images() {
         let image = |width: usize, level: u8| Rgba8::new(width, 3, vec![level; 4 * width * 3]);
-        let frame = with_even_size(&side_by_side(&image(3, 10), &image(2, 20)));
+        let frame = side_by_side(&[image(3, 10), image(2, 20)]);
         assert_eq!((frame.width, frame.height), (6, 4));
         let row: Vec<u8> = frame.data[3 * 6 * 4..].chunks_exact(4).map(|p| p[0]).collect();
         assert_eq!(row, [10, 10, 10, 20, 20, 20]);

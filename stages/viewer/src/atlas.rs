@@ -11,7 +11,7 @@ use flate2::{Compression, write::ZlibEncoder};
 use stage::Progress;
 
 use crate::bake::Volume;
-use crate::bricks::{BRICK_SIDE, Bricks, VOXELS};
+use crate::bricks::{BRICK_SIDE, Bricks, VOXELS, grid_index};
 use crate::view::Components;
 
 /// Number of components of view dependence: the channels of one texture (docs/design/042).
@@ -25,8 +25,6 @@ const BYTES_PER_STEP: usize = 1 << 20;
 /// A packed volume.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Atlas {
-    /// Voxels along each side of the unit cube.
-    pub(crate) resolution: usize,
     /// Number of bricks.
     pub(crate) bricks: usize,
     pub(crate) components: Components,
@@ -43,10 +41,10 @@ impl Atlas {
         let side = volume.resolution / BRICK_SIDE;
         let mut is_kept = vec![false; side * side * side];
         for voxel in &volume.voxels {
-            let [x, y, z] = voxel.position.map(|c| usize::from(c) / BRICK_SIDE);
-            is_kept[x + side * (y + side * z)] = true;
+            let brick = voxel.position.map(|c| usize::from(c) / BRICK_SIDE);
+            is_kept[grid_index(brick, side)] = true;
         }
-        let bricks = Bricks::new(volume.resolution, |[x, y, z]| is_kept[x + side * (y + side * z)]);
+        let bricks = Bricks::new(volume.resolution, |brick| is_kept[grid_index(brick, side)]);
         let components =
             Components::of(volume.voxels.iter().map(|v| (&v.view, v.opacity)), COMPONENTS);
         let mut encoder = ZlibEncoder::new(Vec::new(), Compression::best());
@@ -57,12 +55,7 @@ impl Atlas {
             encoder.write_all(part)?;
             progress.add(part.len() as u64);
         }
-        Ok(Self {
-            resolution: volume.resolution,
-            bricks: bricks.len(),
-            components,
-            bytes: encoder.finish()?,
-        })
+        Ok(Self { bricks: bricks.len(), components, bytes: encoder.finish()? })
     }
 }
 

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use scene::{Bounds, Camera};
 use stage::Progress;
 
-use crate::bricks::{BRICK_SIDE, Bricks, VOXELS};
+use crate::bricks::{BRICK_SIDE, Bricks, VOXELS, grid_index, grid_position};
 use crate::space::{is_reachable, to_world};
 use crate::view::{COEFFICIENTS, fit};
 use crate::visibility::visible_from;
@@ -91,7 +91,7 @@ impl Baker<'_> {
             .into_par_iter()
             .map(|i| {
                 progress.add(1);
-                let brick = [i % side, i / side % side, i / (side * side)];
+                let brick = grid_position(i, side);
                 let low = brick.map(|c| (c * BRICK_SIDE) as f32 / self.resolution as f32);
                 // The upper corner itself belongs to the next brick.
                 let high =
@@ -107,7 +107,7 @@ impl Baker<'_> {
                 Ok(false)
             })
             .collect::<Result<_, RenderError>>()?;
-        Ok(Bricks::new(self.resolution, |[x, y, z]| is_kept[x + side * (y + side * z)]))
+        Ok(Bricks::new(self.resolution, |position| is_kept[grid_index(position, side)]))
     }
 
     /// Returns the number of progress steps of baking.
@@ -118,7 +118,7 @@ impl Baker<'_> {
     /// Computes the voxels' opacities and the cameras that see each voxel.
     pub(crate) fn shape(&self, bricks: Bricks, progress: &Progress) -> Result<Shape, RenderError> {
         let mut opacity = vec![0.0; bricks.len() * VOXELS];
-        let parts = opacity.par_chunks_mut(VOXELS).zip(bricks.brick_positions());
+        let parts = opacity.par_chunks_mut(VOXELS).zip(&bricks.positions);
         parts.try_for_each(|(opacity, &brick)| {
             progress.add(1);
             self.add_opacities(brick, opacity)
@@ -149,13 +149,12 @@ impl Baker<'_> {
                 progress.add(1);
                 let own = brick * VOXELS..(brick + 1) * VOXELS;
                 let visible: Vec<usize> = own.filter(|&v| shape.is_visible(v)).collect();
-                let position = bricks.brick_positions()[brick];
-                let shaded = self.shade_brick(position, &visible, &shape.seen)?;
-                let voxels = visible.into_iter().zip(shaded).map(|(voxel, shaded)| Voxel {
+                let shaded = self.shade_brick(bricks.positions[brick], &visible, &shape.seen)?;
+                let voxels = visible.into_iter().zip(shaded).map(|(voxel, (colour, view))| Voxel {
                     position: bricks.voxel_position(voxel).map(|c| c as u16),
                     opacity: shape.opacity[voxel],
-                    colour: shaded.colour,
-                    view: shaded.view,
+                    colour,
+                    view,
                 });
                 Ok(voxels.collect())
             })
@@ -178,26 +177,27 @@ impl Baker<'_> {
             let position = positions[i * SAMPLES_PER_VOXEL + SAMPLES_PER_VOXEL / 2];
             directions.push(self.directions(position, seen[voxel]));
         }
-        let mut means = vec![Shaded { colour: [0.0; 3], view: [0.0; COEFFICIENTS] }; voxels.len()];
+        let mut means = vec![([0.0; 3], [0.0; COEFFICIENTS]); voxels.len()];
         let mut weights = vec![0.0f32; voxels.len()];
         for source in self.sources {
             let samples = source.samples(&positions)?;
             let shaded = shade(source.as_ref(), &samples, &directions, self.resolution)?;
             let voxels = shaded.into_iter().zip(voxels_of(&samples.densities)).enumerate();
-            for (i, (shaded, densities)) in voxels {
+            for (i, ((colour, view), densities)) in voxels {
                 let opacity = opacity_of(densities, self.resolution);
-                for c in 0..3 {
-                    means[i].colour[c] += opacity * shaded.colour[c];
+                let (mean_colour, mean_view) = &mut means[i];
+                for (mean, value) in mean_colour.iter_mut().zip(colour) {
+                    *mean += opacity * value;
                 }
-                for k in 0..COEFFICIENTS {
-                    means[i].view[k] += opacity * shaded.view[k];
+                for (mean, value) in mean_view.iter_mut().zip(view) {
+                    *mean += opacity * value;
                 }
                 weights[i] += opacity;
             }
         }
-        for (i, mean) in means.iter_mut().enumerate() {
-            mean.colour = mean.colour.map(|c| c / weights[i]);
-            mean.view = mean.view.map(|v| v / weights[i]);
+        for ((colour, view), weight) in means.iter_mut().zip(weights) {
+            *colour = colour.map(|c| c / weight);
+            *view = view.map(|v| v / weight);
         }
         Ok(means)
     }
@@ -217,11 +217,7 @@ impl Baker<'_> {
 }
 
 /// Colour and view dependence of a voxel, as in [`Voxel`].
-#[derive(Clone)]
-struct Shaded {
-    colour: [f32; 3],
-    view: [f32; COEFFICIENTS],
-}
+type Shaded = ([f32; 3], [f32; COEFFICIENTS]);
 
 /// Returns the positions at which a brick's voxels are sampled: voxel by voxel, x fastest.
 fn sample_positions(
@@ -232,17 +228,9 @@ fn sample_positions(
     let corner = brick.map(|c| c * BRICK_SIDE);
     voxels
         .flat_map(|voxel| {
-            let own = [
-                voxel % BRICK_SIDE,
-                voxel / BRICK_SIDE % BRICK_SIDE,
-                voxel / (BRICK_SIDE * BRICK_SIDE) % BRICK_SIDE,
-            ];
+            let own = grid_position(voxel % VOXELS, BRICK_SIDE);
             (0..SAMPLES_PER_VOXEL).map(move |i| {
-                let sub = [
-                    i % SAMPLES_PER_SIDE,
-                    i / SAMPLES_PER_SIDE % SAMPLES_PER_SIDE,
-                    i / (SAMPLES_PER_SIDE * SAMPLES_PER_SIDE),
-                ];
+                let sub = grid_position(i, SAMPLES_PER_SIDE);
                 std::array::from_fn(|axis| {
                     let within = (sub[axis] as f32 + 0.5) / SAMPLES_PER_SIDE as f32;
                     ((corner[axis] + own[axis]) as f32 + within) / resolution as f32
@@ -334,7 +322,7 @@ fn shade(
                     |(raw, weight): (&[f32; 3], &f32)| weight / (1.0 + (-raw[c] - mean[c]).exp());
                 scale * samples.map(light).sum::<f32>()
             });
-            Shaded { colour, view }
+            (colour, view)
         })
         .collect())
 }

@@ -4,6 +4,16 @@
 pub(crate) const BRICK_SIDE: usize = 8;
 /// Number of voxels in a brick.
 pub(crate) const VOXELS: usize = BRICK_SIDE * BRICK_SIDE * BRICK_SIDE;
+/// Returns the position of an entry in a cubic grid of `side`³, x fastest.
+pub(crate) fn grid_position(index: usize, side: usize) -> [usize; 3] {
+    [index % side, index / side % side, index / (side * side)]
+}
+
+/// Returns the index of a position in a cubic grid of `side`³, x fastest.
+pub(crate) fn grid_index([x, y, z]: [usize; 3], side: usize) -> usize {
+    x + side * (y + side * z)
+}
+
 /// Index at a grid position without brick.
 const NO_BRICK: u32 = u32::MAX;
 
@@ -16,7 +26,7 @@ pub(crate) struct Bricks {
     /// Index of the brick at each grid position, or [`NO_BRICK`].
     indices: Vec<u32>,
     /// Grid position of each brick.
-    positions: Vec<[usize; 3]>,
+    pub(crate) positions: Vec<[usize; 3]>,
 }
 
 impl Bricks {
@@ -29,7 +39,7 @@ impl Bricks {
         let mut bricks = Self { resolution, indices: Vec::new(), positions: Vec::new() };
         let grid_side = bricks.bricks_per_side();
         for i in 0..grid_side * grid_side * grid_side {
-            let position = [i % grid_side, i / grid_side % grid_side, i / (grid_side * grid_side)];
+            let position = grid_position(i, grid_side);
             if is_kept(position) {
                 bricks.indices.push(bricks.positions.len() as u32);
                 bricks.positions.push(position);
@@ -50,30 +60,19 @@ impl Bricks {
         self.positions.len()
     }
 
-    /// Returns the bricks' grid positions, in their order.
-    pub(crate) fn brick_positions(&self) -> &[[usize; 3]] {
-        &self.positions
-    }
-
-    /// Returns the index of the brick at a grid position, if any.
-    pub(crate) fn brick_index(&self, [x, y, z]: [usize; 3]) -> Option<usize> {
-        let grid_side = self.bricks_per_side();
-        let index = self.indices[x + grid_side * (y + grid_side * z)];
-        (index != NO_BRICK).then_some(index as usize)
-    }
-
     /// Returns the index of a voxel among those of all bricks; `None` outside of bricks.
     pub(crate) fn voxel_index(&self, position: [usize; 3]) -> Option<usize> {
-        let brick = self.brick_index(position.map(|c| c / BRICK_SIDE))?;
-        let [x, y, z] = position.map(|c| c % BRICK_SIDE);
-        Some(brick * VOXELS + x + BRICK_SIDE * (y + BRICK_SIDE * z))
+        let brick = grid_index(position.map(|c| c / BRICK_SIDE), self.bricks_per_side());
+        let brick = Some(self.indices[brick]).filter(|&brick| brick != NO_BRICK)?;
+        let within = grid_index(position.map(|c| c % BRICK_SIDE), BRICK_SIDE);
+        Some(brick as usize * VOXELS + within)
     }
 
     /// Returns the position of a voxel by its index.
     pub(crate) fn voxel_position(&self, voxel: usize) -> [usize; 3] {
-        let [x, y, z] = self.positions[voxel / VOXELS].map(|c| c * BRICK_SIDE);
-        let i = voxel % VOXELS;
-        [x + i % BRICK_SIDE, y + i / BRICK_SIDE % BRICK_SIDE, z + i / (BRICK_SIDE * BRICK_SIDE)]
+        let corner = self.positions[voxel / VOXELS].map(|c| c * BRICK_SIDE);
+        let within = grid_position(voxel % VOXELS, BRICK_SIDE);
+        std::array::from_fn(|axis| corner[axis] + within[axis])
     }
 
     /// Returns the distance from each grid position to the nearest brick: the maximum of the

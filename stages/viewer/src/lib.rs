@@ -26,13 +26,13 @@ mod visibility;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Failure, GivenInput, RunNode, RunRecord, sink_folders};
+use artifact::{GivenInput, RunNode, RunRecord, bail_bad_input, sink_folders};
 use base64::Engine as _;
 use pixels::{
     DEGRADATION_FILE, Degradation, Filter, Image, Rgba8, encode_png, read_premultiplied,
     resize_pillow,
 };
-use scene::{Bounds, Camera, Intrinsics, Space, Views, undistort_image};
+use scene::{Bounds, Camera, Space, Views, undistort_image};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Stage};
@@ -78,14 +78,10 @@ impl Stage for Viewer {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![(
-            "run",
-            Input::required(
-                &["run"],
-                "in pipeline.yaml: a block that trains a field; nerf-sr passes a folder \
-                with its record, run.json",
-            ),
-        )]
+        Input::run(
+            "in pipeline.yaml: a block that trains a field; nerf-sr passes a folder with its \
+            record, run.json",
+        )
     }
 
     fn output() -> Output {
@@ -93,14 +89,12 @@ impl Stage for Viewer {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let run = RunRecord::read(context.input("run")?)?;
         let is_shown_field = |i: &usize| run.nodes[*i].is_shown && run.nodes[*i].kind == "field";
         let indices: Vec<usize> = (0..run.nodes.len()).filter(is_shown_field).collect();
         let fields: Vec<&RunNode> = indices.iter().map(|&i| &run.nodes[i]).collect();
         if fields.is_empty() {
-            let message = "run.json has no field to show; set input `run: train-ss`";
-            return Err(Failure::BadInput(message.to_owned()).into());
+            bail_bad_input!("run.json has no field to show; set input `run: train-ss`");
         }
         for (index, prefix) in indices.into_iter().zip(sink_folders(&fields)) {
             let node = &run.nodes[index];
@@ -198,7 +192,10 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
         // Spread evenly: a photograph wherever i * photographs / count reaches the next integer.
         let has_photograph = (i + 1) * photographs / count > i * photographs / count;
         let intrinsics = view.camera.intrinsics;
-        let pinhole = pinhole_of_fisheye(&intrinsics);
+        // The page draws a pinhole camera instead of a fisheye one, and ignores other distortion,
+        // which is small enough.
+        let is_fisheye = intrinsics.distortion.is_fisheye();
+        let pinhole = is_fisheye.then(|| intrinsics.pinhole()).flatten();
         let photograph = match &view.image {
             Some(file) if has_photograph => {
                 let image = straight_alpha(&read_premultiplied(&folder.join(file))?);
@@ -232,12 +229,6 @@ fn straight_alpha(image: &Image) -> Rgba8 {
         }
     }
     Image::new(image.width, image.height, 4, data).to_rgba8()
-}
-
-/// Returns the pinhole camera that the page draws instead of a fisheye camera. The page ignores
-/// other distortion, which is small enough.
-fn pinhole_of_fisheye(intrinsics: &Intrinsics) -> Option<Intrinsics> {
-    if intrinsics.distortion.is_fisheye() { intrinsics.pinhole() } else { None }
 }
 
 /// Shrinks an image by a whole factor to at most `max_width` pixels in width.

@@ -219,12 +219,7 @@ mod tests {
                 photograph_size: None,
             }],
         };
-        let atlas = Atlas {
-            resolution: 64,
-            bricks: 0,
-            components: Components::default(),
-            bytes: vec![1, 2, 3],
-        };
+        let atlas = Atlas { bricks: 0, components: Components::default(), bytes: vec![1, 2, 3] };
         let text = page(&scene, &atlas).unwrap().into_string();
         assert!(!text.contains("<b onclick") && text.contains("&lt;b onclick"));
         let scene_start = text.find("id=\"scene\"").unwrap();

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use scene::{Bounds, Camera};
 use stage::Progress;
 
-use crate::bricks::{BRICK_SIDE, Bricks};
+use crate::bricks::{BRICK_SIDE, Bricks, grid_index};
 use crate::space::{leap_along, step_along};
 
 /// Maximum number of observing cameras: one bit each (docs/design/042).
@@ -100,8 +100,8 @@ impl March<'_> {
     /// Returns the distance in bricks from a position in voxels to the nearest brick.
     fn distance(&self, position: [f32; 3]) -> u8 {
         let side = self.bricks.bricks_per_side();
-        let [x, y, z] = position.map(|c| (c.max(0.0) as usize / BRICK_SIDE).min(side - 1));
-        self.distances[x + side * (y + side * z)]
+        let brick = position.map(|c| (c.max(0.0) as usize / BRICK_SIDE).min(side - 1));
+        self.distances[grid_index(brick, side)]
     }
 
     /// Returns the voxels around a position, each with its share of the interpolated opacity.

@@ -33,26 +33,14 @@ impl LpipsNetwork {
     }
 
     pub(super) fn labels(self) -> Labels {
-        match self {
-            Self::Squeeze => Labels {
-                key: "lpips",
-                table: "LPIPS ↓",
-                summary: "LPIPS",
-                convention: "SqueezeNet 1.1 (lpips)",
-            },
-            Self::Alex => Labels {
-                key: "lpips_alex",
-                table: "LPIPS ↓ AlexNet",
-                summary: "LPIPS (AlexNet)",
-                convention: "AlexNet (lpips_alex)",
-            },
-            Self::Vgg => Labels {
-                key: "lpips_vgg",
-                table: "LPIPS ↓ VGG-16",
-                summary: "LPIPS (VGG-16)",
-                convention: "VGG-16 (lpips_vgg)",
-            },
-        }
+        let [key, table, summary, convention] = match self {
+            Self::Squeeze => ["lpips", "LPIPS ↓", "LPIPS", "SqueezeNet 1.1 (lpips)"],
+            Self::Alex => {
+                ["lpips_alex", "LPIPS ↓ AlexNet", "LPIPS (AlexNet)", "AlexNet (lpips_alex)"]
+            }
+            Self::Vgg => ["lpips_vgg", "LPIPS ↓ VGG-16", "LPIPS (VGG-16)", "VGG-16 (lpips_vgg)"],
+        };
+        Labels { key, table, summary, convention }
     }
 }
 

@@ -1,4 +1,4 @@
-use artifact::{Failure, GivenInput};
+use artifact::GivenInput;
 use metrics::{Score, ScoreFormat, Scores};
 use pixels::Image;
 use stage::Rule;
@@ -32,7 +32,8 @@ impl LpipsPool {
     fn new(folder: &std::path::Path, network: LpipsNetwork) -> anyhow::Result<Self> {
         let pool =
             Self { folder: folder.to_path_buf(), network, free: std::sync::Mutex::default() };
-        pool.give_back(pool.take()?);
+        let first = pool.take()?;
+        pool.free().push(first);
         Ok(pool)
     }
 
@@ -40,14 +41,10 @@ impl LpipsPool {
         self.free.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
-    fn take(&self) -> Result<Lpips, Failure> {
+    fn take(&self) -> Result<Lpips, artifact::Failure> {
         use artifact::FailureExt as _;
         let free = self.free().pop();
         free.map_or_else(|| Lpips::read(&self.folder, self.network).bad_input("weights"), Ok)
-    }
-
-    fn give_back(&self, lpips: Lpips) {
-        self.free().push(lpips);
     }
 }
 
@@ -67,10 +64,8 @@ impl Perceptual {
                 required_files(&LpipsNetwork::ALL)
             );
         }
-        let mut pools = Vec::with_capacity(given.len());
-        for &network in &given {
-            pools.push(LpipsPool::new(folder, network)?);
-        }
+        let pools = given.iter().map(|network| LpipsPool::new(folder, *network));
+        let pools = pools.collect::<anyhow::Result<_>>()?;
         Ok(Self { given, min_side, pools })
     }
 
@@ -82,7 +77,7 @@ impl Perceptual {
         for pool in self.pools.iter().filter(|pool| side >= pool.network.min_size()) {
             let lpips = pool.take()?;
             distances[pool.network as usize] = Some(lpips.distance(render, truth)?);
-            pool.give_back(lpips);
+            pool.free().push(lpips);
         }
         Ok(distances)
     }
@@ -97,9 +92,9 @@ impl Perceptual {
 impl Perceptual {
     pub(crate) fn new(weights: Option<&GivenInput>, min_side: usize) -> anyhow::Result<Self> {
         if weights.is_some() {
-            let message = "input weights: LPIPS needs libtorch, and eval was built without it; run \
-                `make build`";
-            return Err(Failure::Usage(message.to_owned()).into());
+            artifact::bail_usage!(
+                "input weights: LPIPS needs libtorch, and eval was built without it; run `make build`"
+            );
         }
         Ok(Self { given: Vec::new(), min_side })
     }
@@ -112,14 +107,14 @@ impl Perceptual {
 impl Perceptual {
     /// Returns a log line for each given network that is left out for small views.
     pub(crate) fn notes(&self) -> Vec<String> {
-        let mut notes = Vec::new();
-        for network in self.given.iter().filter(|network| self.is_too_small(**network)) {
+        let too_small = self.given.iter().filter(|network| self.is_too_small(**network));
+        let note = |network: &LpipsNetwork| {
             let (name, size) = (network.labels().summary, network.min_size());
-            notes.push(format!(
+            format!(
                 "{name} needs views of at least {size}×{size} pixels; smaller views have no score"
-            ));
-        }
-        notes
+            )
+        };
+        too_small.map(note).collect()
     }
 
     /// True if a view is too small for a given network.
@@ -144,10 +139,6 @@ pub(crate) fn weights_rule() -> Rule {
 const MISSING: &str = "weights not given";
 
 impl Metric for Perceptual {
-    fn name(&self) -> &'static str {
-        "lpips"
-    }
-
     fn figures(&self) -> Vec<ScoreFormat> {
         let mut figures = LpipsNetwork::ALL
             .map(LpipsNetwork::labels)
@@ -165,12 +156,11 @@ impl Metric for Perceptual {
         }
         let given: Vec<&str> =
             self.given.iter().map(|network| network.labels().convention).collect();
-        let missing = if lacking.is_empty() {
-            String::new()
-        } else {
-            format!("; {MISSING} for others: {}", required_files(&lacking))
-        };
-        format!("v0.1, inputs in [-1, 1], by {}{missing}", given.join(", "))
+        let mut text = format!("v0.1, inputs in [-1, 1], by {}", given.join(", "));
+        if !lacking.is_empty() {
+            text += &format!("; {MISSING} for others: {}", required_files(&lacking));
+        }
+        text
     }
 
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
@@ -187,13 +177,10 @@ impl Metric for Perceptual {
 
     fn summary(&self, mean: &Scores) -> Option<String> {
         value(mean, "psnr")?;
-        let mut known = Vec::new();
-        for network in LpipsNetwork::ALL {
-            let labels = network.labels();
-            if let Some(distance) = value(mean, labels.key) {
-                known.push(format!("{} {distance:.4}", labels.summary));
-            }
-        }
+        let labels = LpipsNetwork::ALL.map(LpipsNetwork::labels).into_iter();
+        let known: Vec<String> = labels
+            .filter_map(|own| Some(format!("{} {:.4}", own.summary, value(mean, own.key)?)))
+            .collect();
         Some(if known.is_empty() {
             format!("LPIPS {}", self.missing())
         } else {

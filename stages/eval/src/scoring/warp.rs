@@ -23,12 +23,9 @@ const MAX_DISTANCE_PER_DEPTH: f64 = 0.3527;
 
 /// Returns the other view whose centre is nearest to a camera's.
 fn neighbour<'a>(camera: &Camera, views: &'a [View]) -> Option<&'a View> {
+    let distance = |view: &View| (view.camera.centre() - camera.centre()).length_squared();
     let others = views.iter().filter(|view| view.camera.name != camera.name);
-    others.min_by(|a, b| squared_distance(camera, a).total_cmp(&squared_distance(camera, b)))
-}
-
-fn squared_distance(camera: &Camera, view: &View) -> f64 {
-    (view.camera.centre() - camera.centre()).length_squared()
+    others.min_by(|a, b| distance(a).total_cmp(&distance(b)))
 }
 
 /// True if two cameras are near enough for a comparison of their views, by
@@ -73,9 +70,8 @@ fn warp(view: &TrueView<'_>, neighbour: &TrueView<'_>) -> Option<(WarpScore, Rgb
     let other = SurfaceMap { camera: neighbour.camera, map: DepthMap::of(neighbour.depth)? };
     let mut positions = surface.positions_in(&other);
     if let Some(mask) = &view.mask {
-        for (position, _) in positions.iter_mut().zip(&mask.counts).filter(|(_, counts)| !**counts)
-        {
-            *position = None;
+        for (position, counts) in positions.iter_mut().zip(&mask.counts) {
+            *position = position.filter(|_| *counts);
         }
     }
     let size = (other_truth.width, other_truth.height);
@@ -95,11 +91,7 @@ fn warp(view: &TrueView<'_>, neighbour: &TrueView<'_>) -> Option<(WarpScore, Rgb
             continue;
         };
         let colour = other_truth.colour_at(position);
-        let mut error = 0.0;
-        for c in 0..3 {
-            error += f64::from(colour[c] - pixel[c]).powi(2);
-        }
-        sum += error;
+        sum += (0..3).map(|c| f64::from(colour[c] - pixel[c]).powi(2)).sum::<f64>();
         visible += 1;
         data.extend(colour.map(to_u8));
         data.push(255);

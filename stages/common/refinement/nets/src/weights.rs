@@ -11,29 +11,14 @@ use crate::adam::all_finite;
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
     /// The file can't be opened or written.
-    #[error("{path}: {source}")]
-    Io {
-        /// Path of the file.
-        path: PathBuf,
-        /// Cause.
-        source: std::io::Error,
-    },
+    #[error("{0}: {1}")]
+    Io(PathBuf, #[source] std::io::Error),
     /// The file isn't safetensors, or its tensors aren't those of the network.
-    #[error("{path}: {reason}; check that the weights are those of this network")]
-    Format {
-        /// Path of the file.
-        path: PathBuf,
-        /// Reason, as a sentence fragment.
-        reason: String,
-    },
-    /// A tensor to be written isn't finite.
-    #[error("{path}: tensor {name} is not finite; lower the learning rate")]
-    NotFinite {
-        /// Path of the file.
-        path: PathBuf,
-        /// Name of the tensor.
-        name: String,
-    },
+    #[error("{0}: {1}; check that the weights are those of this network")]
+    Format(PathBuf, String),
+    /// A tensor to be written, by its name, isn't finite.
+    #[error("{0}: tensor {1} is not finite; lower the learning rate")]
+    NotFinite(PathBuf, String),
     /// A libtorch operation failed.
     #[error("libtorch: {0}")]
     Torch(#[from] TchError),
@@ -49,8 +34,7 @@ pub struct Weights {
 impl Weights {
     /// Reads a file of f32, f16, i64 or u8 tensors; f16 becomes f32.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
-        let bytes = std::fs::read(path)
-            .map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })?;
+        let bytes = std::fs::read(path).map_err(|e| WeightsError::Io(path.to_path_buf(), e))?;
         let file =
             SafeTensors::deserialize(&bytes).map_err(|e| format_error(path, e.to_string()))?;
         let mut tensors = BTreeMap::new();
@@ -67,11 +51,9 @@ impl Weights {
                     return Err(format_error(path, reason));
                 }
             };
-            let tensor = Tensor::from_data_size(view.data(), &shape, kind);
-            tensors.insert(
-                name,
-                if kind == Kind::Half { tensor.to_kind(Kind::Float) } else { tensor },
-            );
+            let kept_kind = if kind == Kind::Half { Kind::Float } else { kind };
+            let tensor = Tensor::from_data_size(view.data(), &shape, kind).to_kind(kept_kind);
+            tensors.insert(name, tensor);
         }
         Ok(Self { path: path.to_path_buf(), tensors })
     }
@@ -79,19 +61,16 @@ impl Weights {
     /// Returns the i64 tensor of this name, which must have `count` elements.
     pub fn integers(&self, name: &str, count: usize) -> Result<Vec<i64>, WeightsError> {
         let tensor = self.tensors.get(name).filter(|t| t.kind() == Kind::Int64);
-        let integers = tensor.and_then(|t| Vec::<i64>::try_from(t).ok());
-        integers
-            .filter(|i| i.len() == count)
-            .ok_or_else(|| self.error(format!("no tensor {name} of {count} i64 values")))
+        let integers =
+            tensor.and_then(|t| Vec::<i64>::try_from(t).ok().filter(|i| i.len() == count));
+        integers.ok_or_else(|| self.error(format!("no tensor {name} of {count} i64 values")))
     }
 
     /// Returns the u8 tensor of this name, which must have `count` elements.
     pub fn bytes(&self, name: &str, count: i64) -> Result<Tensor, WeightsError> {
-        let bytes =
-            self.tensors.get(name).filter(|t| t.kind() == Kind::Uint8 && t.size() == [count]);
-        bytes
-            .map(Tensor::shallow_clone)
-            .ok_or_else(|| self.error(format!("no tensor {name} of {count} bytes")))
+        let bytes = self.tensors.get(name).filter(|t| t.kind() == Kind::Uint8);
+        let bytes = bytes.filter(|t| t.size() == [count]).map(Tensor::shallow_clone);
+        bytes.ok_or_else(|| self.error(format!("no tensor {name} of {count} bytes")))
     }
 
     /// Returns whether the file has a tensor of this name.
@@ -102,9 +81,8 @@ impl Weights {
     /// Returns the shape of a tensor, which must have `N` dimensions: for networks whose size is
     /// read from their file.
     pub fn shape<const N: usize>(&self, name: &str) -> Result<[i64; N], WeightsError> {
-        let tensor =
-            self.tensors.get(name).ok_or_else(|| self.error(format!("no tensor {name}")))?;
-        let size = tensor.size();
+        let tensor = self.tensors.get(name);
+        let size = tensor.ok_or_else(|| self.error(format!("no tensor {name}")))?.size();
         size.as_slice().try_into().map_err(|_| {
             self.error(format!("tensor {name}: expected {N} dimensions, found shape {size:?}"))
         })
@@ -129,7 +107,7 @@ impl Weights {
 }
 
 fn format_error(path: &Path, reason: String) -> WeightsError {
-    WeightsError::Format { path: path.to_path_buf(), reason }
+    WeightsError::Format(path.to_path_buf(), reason)
 }
 
 /// Writes named tensors of f32, i64 or u8 as safetensors without metadata, so that equal tensors
@@ -137,14 +115,13 @@ fn format_error(path: &Path, reason: String) -> WeightsError {
 pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
     for (name, tensor) in tensors {
         if !all_finite(std::slice::from_ref(tensor))? {
-            let (path, name) = (path.to_path_buf(), name.clone());
-            return Err(WeightsError::NotFinite { path, name });
+            return Err(WeightsError::NotFinite(path.to_path_buf(), name.clone()));
         }
     }
     let bytes = serialized(tensors)
         .map_err(std::io::Error::other)
         .and_then(|bytes| std::fs::write(path, bytes));
-    bytes.map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })
+    bytes.map_err(|e| WeightsError::Io(path.to_path_buf(), e))
 }
 
 /// Serialises named tensors as safetensors.

@@ -468,11 +468,13 @@ struct Tiles {
 }
 
 impl Tiles {
-    /// Returns the number of tiles along a row of some output maps, and of all tiles.
+    /// Returns blocks of all tiles of some output maps.
     #[inline(always)]
-    fn of(maps: &Maps) -> (usize, usize) {
+    fn blocks_of(maps: &Maps) -> impl Iterator<Item = Self> + use<> {
         let across = maps.width.div_ceil(TILE_OUTPUTS);
-        (across, across * maps.height.div_ceil(TILE_OUTPUTS))
+        let all = across * maps.height.div_ceil(TILE_OUTPUTS);
+        let count = move |first| BLOCK.min(all - first);
+        (0..all).step_by(BLOCK).map(move |first| Self { first, count: count(first), across })
     }
 
     /// Returns column and row of a tile's first output.
@@ -481,12 +483,25 @@ impl Tiles {
         let index = self.first + tile;
         (index % self.across * TILE_OUTPUTS, index / self.across * TILE_OUTPUTS)
     }
+}
 
-    /// Returns the number of tiles, rounded up to a multiple of [`ROWS`].
-    #[inline(always)]
-    fn padded(self) -> usize {
-        self.count.next_multiple_of(ROWS)
-    }
+/// Calls a function for all `$rows` rows and all outputs of a product, in parts whose sums fit in
+/// registers.
+macro_rules! in_register_tiles {
+    ($function:ident, $product:ident, $to:ident, $rows:expr) => {
+        for row in (0..$rows).step_by(ROWS) {
+            let mut output = 0;
+            while L::WIDE && output + 2 <= $product.outputs {
+                $function::<L, ROWS, 2>($product, $to, row, output);
+                output += 2;
+            }
+            while output < $product.outputs {
+                $function::<L, { ROWS / 2 }, 1>($product, $to, row, output);
+                $function::<L, { ROWS / 2 }, 1>($product, $to, row + ROWS / 2, output);
+                output += 1;
+            }
+        }
+    };
 }
 
 /// Multiplies, for each point, the rows by its matrix: `rows.depth` × `to.depth` blocks of 16 × 16
@@ -498,30 +513,22 @@ fn multiply<L: Lanes>(tiles: Tiles, rows: &BlockRows, matrix: &[Vector], to: &mu
     for point in 0..POINTS {
         let (rows, to) = (rows.point(point), to.point_mut(point));
         let product = Product { rows, inputs, matrix: &matrix[point * size..][..size], outputs };
-        for tile in (0..tiles.padded()).step_by(ROWS) {
-            let mut output = 0;
-            while L::WIDE && output + 2 <= outputs {
-                multiply_tile::<L, ROWS, 2>(product, to, tile, output);
-                output += 2;
-            }
-            while output < outputs {
-                multiply_tile::<L, { ROWS / 2 }, 1>(product, to, tile, output);
-                multiply_tile::<L, { ROWS / 2 }, 1>(product, to, tile + ROWS / 2, output);
-                output += 1;
-            }
-        }
+        // The number of tiles, rounded up to a multiple of [`ROWS`].
+        in_register_tiles!(multiply_tile, product, to, tiles.count.next_multiple_of(ROWS));
     }
 }
 
-/// Product of rows and a matrix.
+/// Factors of a product at one point.
 #[derive(Clone, Copy)]
 struct Product<'a> {
+    /// A row of inputs for each tile.
     rows: &'a [Vector],
-    /// Number of vectors per row.
+    /// Number of vectors per row of inputs.
     inputs: usize,
-    /// Sixteen rows of `outputs` vectors for each vector of inputs.
+    /// Sixteen rows of `outputs` vectors for each vector of inputs; in an outer product a row of
+    /// gradients for each tile.
     matrix: &'a [Vector],
-    /// Number of vectors per row of the product.
+    /// Number of vectors per row of `matrix`.
     outputs: usize,
 }
 
@@ -576,44 +583,22 @@ fn add_outer_products<L: Lanes>(
     let size = inputs * LANES * outputs;
     for point in 0..POINTS {
         let rows = &rows.point(point)[..tiles.count * inputs];
-        let gradients = &gradients.point(point)[..tiles.count * outputs];
-        let product = OuterProduct { rows, inputs, gradients, outputs };
+        let matrix = &gradients.point(point)[..tiles.count * outputs];
+        let product = Product { rows, inputs, matrix, outputs };
         let to = &mut to[point * size..][..size];
-        for input in (0..inputs * LANES).step_by(ROWS) {
-            let mut output = 0;
-            while L::WIDE && output + 2 <= outputs {
-                add_outer_tile::<L, ROWS, 2>(product, to, input, output);
-                output += 2;
-            }
-            while output < outputs {
-                add_outer_tile::<L, { ROWS / 2 }, 1>(product, to, input, output);
-                add_outer_tile::<L, { ROWS / 2 }, 1>(product, to, input + ROWS / 2, output);
-                output += 1;
-            }
-        }
+        in_register_tiles!(add_outer_tile, product, to, inputs * LANES);
     }
-}
-
-/// Sum over tiles of the products of a tile's inputs and gradients.
-#[derive(Clone, Copy)]
-struct OuterProduct<'a> {
-    rows: &'a [Vector],
-    /// Number of vectors per row of inputs.
-    inputs: usize,
-    gradients: &'a [Vector],
-    /// Number of vectors per row of gradients.
-    outputs: usize,
 }
 
 /// Adds the products of `R` inputs and `V` vectors of outputs in registers.
 #[inline(always)]
 fn add_outer_tile<L: Lanes, const R: usize, const V: usize>(
-    product: OuterProduct<'_>,
+    product: Product<'_>,
     to: &mut [Vector],
     input: usize,
     output: usize,
 ) {
-    let OuterProduct { rows, inputs, gradients, outputs } = product;
+    let Product { rows, inputs, matrix: gradients, outputs } = product;
     let mut sums = [[L::splat(0.0); V]; R];
     for r in 0..R {
         for v in 0..V {
@@ -732,14 +717,10 @@ kernel! {
         let Scratch { inputs, products, .. } = scratch;
         inputs.resize(layer.input_vectors);
         products.resize(layer.output_vectors);
-        let (across, count) = Tiles::of(y);
-        let mut first = 0;
-        while first < count {
-            let tiles = Tiles { first, count: (count - first).min(BLOCK), across };
+        for tiles in Tiles::blocks_of(y) {
             transform_inputs::<L>(x, tiles, inputs);
             multiply::<L>(tiles, inputs, &layer.forward, products);
             transform_outputs::<L>(products, tiles, &layer.bias, after, y);
-            first += BLOCK;
         }
     }
 }
@@ -753,11 +734,8 @@ kernel! {
         inputs.resize(layer.input_vectors);
         products.resize(layer.input_vectors);
         transformed.resize(layer.output_vectors);
-        let (across, count) = Tiles::of(dy);
         let mut dx = dx;
-        let mut first = 0;
-        while first < count {
-            let tiles = Tiles { first, count: (count - first).min(BLOCK), across };
+        for tiles in Tiles::blocks_of(dy) {
             transform_inputs::<L>(x, tiles, inputs);
             transform_gradients::<L>(dy, gate, tiles, transformed, &mut gradients.bias);
             add_outer_products::<L>(tiles, inputs, transformed, &mut gradients.transformed);
@@ -765,7 +743,6 @@ kernel! {
                 multiply::<L>(tiles, transformed, &layer.backward, products);
                 add_input_gradients::<L>(products, tiles, dx);
             }
-            first += BLOCK;
         }
     }
 }

@@ -75,37 +75,30 @@ fn clamped_index(start: isize, offset: usize, size: usize) -> usize {
 }
 
 /// One of eight orientations of a window: rotations by right angles and reflections.
+/// Bit 4 exchanges rows and columns; bits 1 and 2 mirror x and y.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Orientation {
-    /// True if rows and columns are exchanged.
-    swap: bool,
-    flip_x: bool,
-    flip_y: bool,
-}
+pub(crate) struct Orientation(u8);
 
 impl Orientation {
     /// All orientations; the first is the identity.
-    pub(crate) const ALL: [Self; 8] = {
-        let mut all = [Self { swap: false, flip_x: false, flip_y: false }; 8];
-        let mut i = 0;
-        while i < 8 {
-            all[i] = Self { swap: i & 4 != 0, flip_x: i & 1 != 0, flip_y: i & 2 != 0 };
-            i += 1;
-        }
-        all
-    };
+    pub(crate) const ALL: [Self; 8] =
+        [Self(0), Self(1), Self(2), Self(3), Self(4), Self(5), Self(6), Self(7)];
+
+    fn has(self, bit: u8) -> bool {
+        self.0 & bit != 0
+    }
 
     /// Returns the window in this orientation: width and height are exchanged if necessary.
     pub(crate) fn oriented(self, window: Window) -> Window {
         let (width, height) = window.size;
-        Window { size: if self.swap { (height, width) } else { (width, height) }, ..window }
+        Window { size: if self.has(4) { (height, width) } else { (width, height) }, ..window }
     }
 
     /// Maps a column and row of the oriented window to those of the original window.
     pub(crate) fn source(self, window: Window, x: usize, y: usize) -> (usize, usize) {
-        let (x, y) = if self.swap { (y, x) } else { (x, y) };
+        let (x, y) = if self.has(4) { (y, x) } else { (x, y) };
         let (width, height) = window.size;
-        (if self.flip_x { width - 1 - x } else { x }, if self.flip_y { height - 1 - y } else { y })
+        (if self.has(1) { width - 1 - x } else { x }, if self.has(2) { height - 1 - y } else { y })
     }
 }
 

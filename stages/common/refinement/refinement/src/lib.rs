@@ -15,7 +15,7 @@
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
 //! * [`with_references`]: adds reference features to a view; [`WarpOptions`] has the options.
 //! * [`LrObservations`]: LR photographs that views are made consistent with (data consistency).
-//! * [`RefinerTrainer`]: a [`Training`] on examples; [`RefinerTrainingOptions`] has its options.
+//! * [`RefinerTrainer`]: a [`Training`] on examples; [`TrainingOptions`] has its options.
 //! * [`RefinerFile`]: description of a refiner in its artifact.
 //! * [`paper`]: the paper's own network, for comparison.
 //!
@@ -52,6 +52,6 @@ mod warped_reference;
 pub use consistency::LrObservations;
 pub use error::RefinementError;
 pub use refiner::{Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, WEIGHTS_FILE};
-pub use trainer::{RefinerScores, RefinerTrainer, RefinerTrainingOptions, Training};
+pub use trainer::{RefinerTrainer, Training, TrainingOptions};
 pub use view::{KnownView, Rendered};
 pub use warped_reference::{ConditionedView, ReferenceStatistics, WarpOptions, with_references};

@@ -4,9 +4,6 @@ use crate::convolution::{
     After, Convolution, LayerGradients, Maps, Scratch, convolve, convolve_back,
 };
 
-/// Layers of a [`Refiner`](crate::Refiner), in order.
-pub(crate) struct Layers(pub(crate) Vec<Convolution>);
-
 /// Memory of one thread's passes.
 #[derive(Debug, Default)]
 pub(crate) struct Pass {
@@ -20,17 +17,18 @@ pub(crate) struct Pass {
 }
 
 impl Pass {
-    /// Runs the layers on the samples of a window, and returns the output.
+    /// Runs the layers of a [`Refiner`](crate::Refiner) on the samples of a window, and returns the
+    /// output.
     pub(crate) fn forward(
         &mut self,
-        layers: &Layers,
+        layers: &[Convolution],
         (width, height): (usize, usize),
         samples: &[f32],
     ) -> &Maps {
-        self.maps.resize_with(layers.0.len() + 1, Maps::default);
+        self.maps.resize_with(layers.len() + 1, Maps::default);
         self.maps[0].fill(width, height, samples);
-        let last = layers.0.len() - 1;
-        for (i, layer) in layers.0.iter().enumerate() {
+        let last = layers.len() - 1;
+        for (i, layer) in layers.iter().enumerate() {
             let (before, after) = self.maps.split_at_mut(i + 1);
             // Between the first and the last layer, odd ones begin a residual block and even ones
             // end it.
@@ -47,21 +45,21 @@ impl Pass {
     }
 
     /// Sets all gradients to 0.
-    pub(crate) fn reset(&mut self, layers: &Layers) {
-        self.gradients.resize_with(layers.0.len(), LayerGradients::default);
-        for (gradients, layer) in self.gradients.iter_mut().zip(&layers.0) {
+    pub(crate) fn reset(&mut self, layers: &[Convolution]) {
+        self.gradients.resize_with(layers.len(), LayerGradients::default);
+        for (gradients, layer) in self.gradients.iter_mut().zip(layers) {
             gradients.reset(layer);
         }
     }
 
     /// Adds the gradients of the last forward pass, from those of its output's samples.
-    pub(crate) fn backward(&mut self, layers: &Layers, output_gradients: &[f32]) {
+    pub(crate) fn backward(&mut self, layers: &[Convolution], output_gradients: &[f32]) {
         let Self { maps, gradient_maps: [output, input, block], gradients, scratch } = self;
-        let last = layers.0.len() - 1;
+        let last = layers.len() - 1;
         let result = &maps[last + 1];
         output.fill(result.width, result.height, output_gradients);
         for i in (0..=last).rev() {
-            let (layer, x, gradients) = (&layers.0[i], &maps[i], &mut gradients[i]);
+            let (layer, x, gradients) = (&layers[i], &maps[i], &mut gradients[i]);
             if i == 0 {
                 convolve_back(layer, x, output, None, gradients, None, scratch);
                 return;
@@ -135,7 +133,7 @@ mod tests {
         let weights_of = |count| numbers(count, 2);
 
         let layers = parameters.iter().map(|(kernels, bias)| Convolution::new(kernels, bias));
-        let layers = Layers(layers.collect());
+        let layers: Vec<Convolution> = layers.collect();
         let (mut pass, mut output) = (Pass::default(), Vec::new());
         pass.reset(&layers);
         pass.forward(&layers, SIZE, &samples).copy_samples(outputs, &mut output);

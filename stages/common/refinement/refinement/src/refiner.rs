@@ -10,7 +10,7 @@ use tch::{TchError, Tensor};
 use crate::convolution::Convolution;
 use crate::error::RefinementError;
 use crate::folded::{FOLD, Orientation, Window};
-use crate::network::{Layers, Pass};
+use crate::network::Pass;
 use crate::view::{INPUTS, OUTPUTS, REFERENCE_INPUTS};
 use crate::warped_reference::WarpOptions;
 
@@ -164,9 +164,9 @@ impl Refiner {
     }
 
     /// Returns the layers, transformed for convolution.
-    pub(crate) fn layers(&self) -> Layers {
+    pub(crate) fn layers(&self) -> Vec<Convolution> {
         let layers = self.parameters.par_chunks_exact(2);
-        Layers(layers.map(|layer| Convolution::new(&layer[0], &layer[1])).collect())
+        layers.map(|layer| Convolution::new(&layer[0], &layer[1])).collect()
     }
 
     /// Adds `residual_weight` times the network's residual to a view, and clamps colours to 0..1. A
@@ -232,7 +232,7 @@ impl Refiner {
 /// window and its receptive field.
 fn predict_residual(
     architecture: RefinerArchitecture,
-    layers: &Layers,
+    layers: &[Convolution],
     pass: &mut Pass,
     view: &Image,
     window: Window,
@@ -280,16 +280,11 @@ pub(crate) fn layer_sizes(architecture: RefinerArchitecture) -> Vec<(String, usi
     std::iter::once(first).chain(blocks).chain([last]).collect()
 }
 
-/// Returns the shape of a layer's kernel: outputs × rows × columns × inputs.
-fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
-    [outputs as i64, 3, 3, inputs as i64]
-}
-
 /// Returns names and shapes of the parameters.
 fn parameter_shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
     let shapes = layer_sizes(architecture).into_iter().flat_map(|(name, inputs, outputs)| {
         [
-            (format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()),
+            (format!("{name}.kernel"), vec![outputs as i64, 3, 3, inputs as i64]),
             (format!("{name}.bias"), vec![outputs as i64]),
         ]
     });

@@ -6,10 +6,11 @@ use pixels::{Image, psnr_of};
 use rayon::prelude::*;
 
 use crate::adam::Adam;
+use crate::convolution::Convolution;
 use crate::error::RefinementError;
 use crate::folded::{FOLD, Orientation, Window};
-use crate::network::{Layers, Pass};
-use crate::refiner::{Refiner, RefinerArchitecture, layer_sizes};
+use crate::network::Pass;
+use crate::refiner::{Network, Refiner, RefinerArchitecture, RefinerFile, layer_sizes};
 use crate::view::{KnownView, OUTPUTS, REFERENCE_INPUTS};
 use crate::warped_reference::{ReferenceStatistics, WarpOptions, with_references};
 
@@ -29,18 +30,20 @@ pub trait Training {
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError>;
 }
 
-/// Options for training a [`Refiner`].
+/// Options for training a [`Refiner`] or a [`PaperRefiner`](crate::paper::PaperRefiner).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RefinerTrainingOptions {
+pub struct TrainingOptions {
     /// Total number of steps.
     pub steps: u64,
     /// Number of patches per step.
     pub batch_size: usize,
-    /// Side of a patch in pixels; an even number.
+    /// Side of a patch in pixels; an even number, for the paper's network a multiple of 8.
     pub patch_size: usize,
-    /// Number of references per view for a reference-based network.
+    /// Number of references per view for a reference-based network; of reference patches per patch
+    /// for the paper's.
     pub references: usize,
-    /// Highest learning rate, reached after a warm-up and followed by cosine decay to 0.
+    /// Highest learning rate, reached after a warm-up and followed by cosine decay to 0; for the
+    /// paper's network the constant rate.
     pub learning_rate: f64,
     /// Seed of all random numbers.
     pub seed: u64,
@@ -51,7 +54,7 @@ pub struct RefinerTrainingOptions {
 /// the scene's colours and transfers to another size (design note 015).
 pub struct RefinerTrainer {
     refiner: Refiner,
-    options: RefinerTrainingOptions,
+    options: TrainingOptions,
     adam: Adam,
     /// Current training views of a reference-based network.
     pool: Option<Pool>,
@@ -67,24 +70,10 @@ struct Pool {
     views: Vec<(usize, Image)>,
 }
 
-impl Pool {
-    /// Draws the views of a round.
-    fn new(
-        round: u64,
-        options: &RefinerTrainingOptions,
-        guidance: WarpOptions,
-        examples: &[KnownView],
-    ) -> Self {
-        let numbers = round * POOL_VIEWS..(round + 1) * POOL_VIEWS;
-        let views = numbers.map(|number| draw_view(number, options, guidance, examples)).collect();
-        Self { round, views }
-    }
-}
-
 /// Draws the `number`-th example of the training run, with random references.
 fn draw_view(
     number: u64,
-    options: &RefinerTrainingOptions,
+    options: &TrainingOptions,
     guidance: WarpOptions,
     examples: &[KnownView],
 ) -> (usize, Image) {
@@ -123,22 +112,9 @@ const PATCHES: u64 = 301;
 const SCORES: u64 = 302;
 const POOLS: u64 = 303;
 
-/// Scores of the validation views.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct RefinerScores {
-    /// Mean PSNR of the rendered views, in dB.
-    pub rendered_psnr: f64,
-    /// Mean PSNR of the refined views with the best residual weight, in dB.
-    pub refined_psnr: f64,
-    /// Factor of the predicted residual, from 0 to 1, that gives the smallest squared error.
-    pub residual_weight: f64,
-    /// Confidence in references as a fraction of their visibility; `None` without references.
-    pub confidence: Option<f64>,
-}
-
 impl RefinerTrainer {
     /// Creates a trainer of `refiner`.
-    pub fn new(refiner: Refiner, options: RefinerTrainingOptions) -> Self {
+    pub fn new(refiner: Refiner, options: TrainingOptions) -> Self {
         let adam = Adam::new(&refiner);
         let shards = (0..SHARDS).map(|_| Shard::default()).collect();
         Self { refiner, options, adam, pool: None, shards }
@@ -149,13 +125,13 @@ impl RefinerTrainer {
         &self.refiner
     }
 
-    /// Scores validation views, with references drawn from the training views, and finds the best
-    /// residual weight.
+    /// Describes the refiner with its scores for validation views, with references drawn from the
+    /// training views, and with the residual weight that gives the smallest squared error.
     pub fn score(
         &self,
         examples: &[KnownView],
         references: &[KnownView],
-    ) -> Result<RefinerScores, RefinementError> {
+    ) -> Result<RefinerFile, RefinementError> {
         let mut statistics = ReferenceStatistics::default();
         let mut views = Vec::with_capacity(examples.len());
         for (number, example) in examples.iter().enumerate() {
@@ -181,19 +157,18 @@ impl RefinerTrainer {
         let residual_weight =
             if power > 0.0 { (inner_product / power).clamp(0.0, 1.0) } else { 0.0 };
         let mut refined = 0.0;
-        for (i, view) in views.iter().enumerate() {
-            let truth = &examples[i].truth;
+        for (view, example) in views.iter().zip(examples) {
             let image = self.refiner.refine_weighted(view, residual_weight as f32, 1)?;
-            let samples = image.data.iter().zip(&truth.data);
-            let error: f64 = samples.map(|(r, t)| f64::from(t - r).powi(2)).sum();
-            refined += psnr_of(error / truth.data.len() as f64);
+            refined += example.psnr(&image);
         }
         let count = examples.len().max(1) as f64;
-        Ok(RefinerScores {
+        Ok(RefinerFile {
+            network: Network::Compact(self.refiner.architecture()),
             rendered_psnr: rendered / count,
             refined_psnr: refined / count,
             residual_weight,
             confidence: (statistics.visible_pixels > 0).then(|| statistics.confidence_share()),
+            data_consistent: false,
         })
     }
 
@@ -225,20 +200,18 @@ impl RefinerTrainer {
         if let Some(guidance) = self.refiner.architecture().guidance
             && self.pool.as_ref().is_none_or(|pool| pool.round != round)
         {
-            self.pool = Some(Pool::new(round, &self.options, guidance, examples));
+            let numbers = round * POOL_VIEWS..(round + 1) * POOL_VIEWS;
+            let view = |number| draw_view(number, &self.options, guidance, examples);
+            self.pool = Some(Pool { round, views: numbers.map(view).collect() });
         }
     }
 
     /// Returns the views that patches are drawn from: the pool, or all examples.
     fn views<'a>(&'a self, examples: &'a [KnownView]) -> Vec<TrainingView<'a>> {
         let Some(pool) = &self.pool else {
-            return examples
-                .iter()
-                .map(|example| TrainingView { view: &example.rendered.view, truth: &example.truth })
-                .collect();
+            return examples.iter().map(|known| (&known.rendered.view, &known.truth)).collect();
         };
-        let views = pool.views.iter();
-        views.map(|(i, view)| TrainingView { view, truth: &examples[*i].truth }).collect()
+        pool.views.iter().map(|(i, view)| (view, &examples[*i].truth)).collect()
     }
 }
 
@@ -249,7 +222,7 @@ impl Training for RefinerTrainer {
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
         let options = self.options;
-        let RefinerTrainingOptions { steps, batch_size, learning_rate, .. } = options;
+        let TrainingOptions { steps, batch_size, learning_rate, .. } = options;
         let step = self.steps();
         if step >= steps {
             return Ok(None);
@@ -303,8 +276,8 @@ impl Shard {
     fn run(
         &mut self,
         architecture: RefinerArchitecture,
-        layers: &Layers,
-        options: &RefinerTrainingOptions,
+        layers: &[Convolution],
+        options: &TrainingOptions,
         step: u64,
         range: Range<usize>,
         views: &[TrainingView<'_>],
@@ -312,7 +285,8 @@ impl Shard {
         let Self { pass, input, residual, predicted, loss } = self;
         let square = Window { x: 0, y: 0, size: (options.patch_size, options.patch_size) };
         let around = square.grown(architecture.receptive_radius());
-        let samples = (options.batch_size * residual_samples(options)) as f64;
+        let patch_samples = options.patch_size * options.patch_size * OUTPUTS;
+        let samples = (options.batch_size * patch_samples) as f64;
         pass.reset(layers);
         *loss = 0.0;
         for i in range {
@@ -336,11 +310,6 @@ impl Shard {
     }
 }
 
-/// Returns the number of samples of a patch's residual.
-fn residual_samples(options: &RefinerTrainingOptions) -> usize {
-    options.patch_size * options.patch_size * OUTPUTS
-}
-
 /// Adds the shards' gradients in order, and returns those of the parameters.
 fn merge_gradients(shards: &mut [Shard], architecture: RefinerArchitecture) -> Vec<Vec<f32>> {
     let [first, others @ ..] = shards else { return Vec::new() };
@@ -356,12 +325,8 @@ fn merge_gradients(shards: &mut [Shard], architecture: RefinerArchitecture) -> V
     gradients.collect::<Vec<_>>().into_iter().flatten().collect()
 }
 
-/// Input view of the network with its ground truth.
-#[derive(Clone, Copy)]
-struct TrainingView<'a> {
-    view: &'a Image,
-    truth: &'a Image,
-}
+/// Input view of the network, and its ground truth.
+type TrainingView<'a> = (&'a Image, &'a Image);
 
 /// Augmented patch of a view.
 struct TrainingPatch<'a> {
@@ -377,11 +342,11 @@ struct TrainingPatch<'a> {
 
 impl<'a> TrainingPatch<'a> {
     /// Draws the `number`-th patch of the training run.
-    fn draw(options: &RefinerTrainingOptions, number: u64, views: &[TrainingView<'a>]) -> Self {
+    fn draw(options: &TrainingOptions, number: u64, views: &[TrainingView<'a>]) -> Self {
         let mut rng = CounterRng::new(options.seed, PATCHES, number);
         let (mut view, mut square) = draw_square(views, options.patch_size, &mut rng);
         for _ in 0..MAX_REDRAWS {
-            if contrast(view.truth, square) >= MIN_CONTRAST {
+            if contrast(view.1, square) >= MIN_CONTRAST {
                 break;
             }
             (view, square) = draw_square(views, options.patch_size, &mut rng);
@@ -408,7 +373,7 @@ impl<'a> TrainingPatch<'a> {
         inputs: &mut Vec<f32>,
         residuals: &mut Vec<f32>,
     ) {
-        let TrainingView { view, truth } = self.view;
+        let (view, truth) = self.view;
         let around = self.square.grown(architecture.receptive_radius());
         around.fold(|x, y| {
             let (x, y) = self.orientation.source(around, x, y);
@@ -441,14 +406,11 @@ fn draw_square<'a>(
     rng: &mut CounterRng,
 ) -> (TrainingView<'a>, Window) {
     let view = views[rng.below(views.len() as u64) as usize];
-    let x = draw_start(view.view.width, side, rng);
-    let y = draw_start(view.view.height, side, rng);
+    // Starts at even pixels, aligned with the folds of whole views.
+    let [x, y] = [view.0.width, view.0.height].map(|size| {
+        (rng.below((size.saturating_sub(side) / FOLD + 1) as u64) as usize * FOLD) as isize
+    });
     (view, Window { x, y, size: (side, side) })
-}
-
-/// Draws the start of a square along an axis: an even pixel, aligned with the folds of whole views.
-fn draw_start(size: usize, side: usize, rng: &mut CounterRng) -> isize {
-    (rng.below((size.saturating_sub(side) / FOLD + 1) as u64) as usize * FOLD) as isize
 }
 
 /// Returns the range of the green channel in a square of the ground truth.
@@ -512,7 +474,7 @@ mod tests {
 
     fn trained(guidance: Option<WarpOptions>) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
-        let options = RefinerTrainingOptions {
+        let options = TrainingOptions {
             steps: 300,
             batch_size: 8,
             patch_size: 16,

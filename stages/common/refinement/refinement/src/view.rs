@@ -1,5 +1,5 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
-use pixels::{DepthMap, Exposure, ExrImage, Image, read_exr};
+use pixels::{DepthMap, Exposure, ExrImage, Image, psnr_of, read_exr};
 use scene::{Background, Camera, Photograph, SurfaceMap, View};
 
 use crate::error::RefinementError;
@@ -164,6 +164,13 @@ impl KnownView {
         }
         let known = Self::new(rendered, photograph.over(background.grey_level()))?;
         Ok((known, exposure))
+    }
+
+    /// Returns the PSNR of an image of the view in dB.
+    pub fn psnr(&self, image: &Image) -> f64 {
+        let samples = image.data.iter().zip(&self.truth.data);
+        let squares: f64 = samples.map(|(a, b)| f64::from(a - b).powi(2)).sum();
+        psnr_of(squares / self.truth.data.len() as f64)
     }
 }
 

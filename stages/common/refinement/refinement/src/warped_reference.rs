@@ -27,20 +27,6 @@ impl Default for WarpOptions {
     }
 }
 
-/// Features of references for some rows of a view.
-#[derive(Debug)]
-struct ReferenceFeatures {
-    /// Features of each pixel:
-    /// * colours of references minus those of the render;
-    /// * confidence, from 0 (visible in no reference) to 1 (visible in a reference from the same
-    ///   direction, at the view's resolution or a finer one, with the rendered colour);
-    /// * detail: colours of references minus those of their own renders. Detail helps even if a
-    ///   reference displays a point slightly displaced or in another light.
-    features: Vec<[f32; FEATURES]>,
-    /// Statistics of each reference.
-    statistics: Vec<ReferenceStatistics>,
-}
-
 /// Number of channels of reference features.
 const FEATURES: usize = REFERENCE_INPUTS - INPUTS;
 
@@ -68,6 +54,13 @@ impl ReferenceStatistics {
         self.visible_pixels += other.visible_pixels;
         self.visibility += other.visibility;
         self.confidence += other.confidence;
+    }
+
+    /// Adds each reference's statistics for other pixels to its sum.
+    pub fn add_each(sums: &mut [Self], others: &[Self]) {
+        for (sum, other) in sums.iter_mut().zip(others) {
+            sum.add(other);
+        }
     }
 }
 
@@ -113,6 +106,12 @@ impl FeatureSums {
         self.max_confidence = self.max_confidence.max(pixel.confidence);
     }
 
+    /// Returns the features of the pixel:
+    /// * colours of references minus those of the render;
+    /// * confidence, from 0 (visible in no reference) to 1 (visible in a reference from the same
+    ///   direction, at the view's resolution or a finer one, with the rendered colour);
+    /// * detail: colours of references minus those of their own renders. Detail helps even if a
+    ///   reference displays a point slightly displaced or in another light.
     fn features(self) -> [f32; FEATURES] {
         if self.weight > 0.0 {
             let [r, g, b] = self.difference.map(|v| v / self.weight);
@@ -121,31 +120,6 @@ impl FeatureSums {
         } else {
             [0.0; FEATURES]
         }
-    }
-}
-
-impl ReferenceFeatures {
-    /// Warps references to rows of a view and combines them.
-    fn new(
-        rendered: &Rendered,
-        references: &[&KnownView],
-        rows: Range<usize>,
-        options: WarpOptions,
-    ) -> Self {
-        let mut sums = vec![FeatureSums::default(); rendered.view.width * rows.len()];
-        let mut statistics = Vec::with_capacity(references.len());
-        for reference in references {
-            let mut own = ReferenceStatistics::default();
-            let warped = warp(rendered, reference, &rows, options);
-            for (sums, pixel) in sums.iter_mut().zip(&warped) {
-                own.visible_pixels += usize::from(pixel.visibility > 0.0);
-                own.visibility += f64::from(pixel.visibility);
-                own.confidence += f64::from(pixel.confidence);
-                sums.add(pixel);
-            }
-            statistics.push(own);
-        }
-        Self { features: sums.into_iter().map(FeatureSums::features).collect(), statistics }
     }
 }
 
@@ -168,13 +142,12 @@ fn warp(
     });
     let sums = Sums::new(width, &terms.collect::<Vec<_>>());
     let mut pixels = Vec::with_capacity(width * rows.len());
-    let positions = WarpedPositions { warped: &warped, width };
     for y in rows.start - first_row..rows.end - first_row {
         for x in 0..width {
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
                 let difference = mean_difference(&sums, x, y) / DIFFERENCE_AT_QUARTER_CONFIDENCE;
-                let squared = positions.squared_second_differences(x, y);
+                let squared = squared_second_differences(&warped, width, x, y);
                 own.confidence *= (1.0 + difference * difference).powi(-2)
                     / (1.0 + squared / SECOND_DIFFERENCE_AT_HALF_CONFIDENCE.powi(2));
             }
@@ -217,34 +190,21 @@ fn mean_difference(sums: &Sums<4>, x: usize, y: usize) -> f32 {
     [r, g, b].map(|sum| (sum / count.max(1.0)).powi(2)).iter().sum::<f64>().sqrt() as f32
 }
 
-/// Positions of neighbouring pixels in a reference.
-struct WarpedPositions<'a> {
-    warped: &'a [WarpedPixel],
-    width: usize,
-}
-
-impl WarpedPositions<'_> {
-    /// Returns the position of a pixel's neighbour if the neighbour is visible.
-    fn of_neighbour(&self, x: usize, y: usize, dx: isize, dy: isize) -> Option<[f32; 2]> {
+/// Returns the squared second differences, a + b - 2·own, of the positions around a pixel of warped
+/// rows in a reference: the sum of the horizontal and the vertical one, 0 for one with an invisible
+/// neighbour.
+fn squared_second_differences(warped: &[WarpedPixel], width: usize, x: usize, y: usize) -> f32 {
+    let own = warped[y * width + x].position;
+    let neighbour = |dx: isize, dy: isize| {
         let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
-        let other = (x < self.width).then(|| self.warped.get(y * self.width + x))??;
+        let other = (x < width).then(|| warped.get(y * width + x))??;
         (other.confidence > 0.0).then_some(other.position)
-    }
-
-    /// Returns the squared second differences of the positions around a pixel: the sum of the
-    /// horizontal and the vertical one.
-    fn squared_second_differences(&self, x: usize, y: usize) -> f32 {
-        let own = self.warped[y * self.width + x].position;
-        let horizontal = [self.of_neighbour(x, y, -1, 0), self.of_neighbour(x, y, 1, 0)];
-        let vertical = [self.of_neighbour(x, y, 0, -1), self.of_neighbour(x, y, 0, 1)];
-        squared_second_difference(own, horizontal) + squared_second_difference(own, vertical)
-    }
-}
-
-/// Returns the squared second difference a + b - 2·own; 0 if a neighbour is missing.
-fn squared_second_difference(own: [f32; 2], neighbours: [Option<[f32; 2]>; 2]) -> f32 {
-    let [Some(a), Some(b)] = neighbours else { return 0.0 };
-    (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
+    };
+    let squared = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
+        let Some((a, b)) = a.zip(b) else { return 0.0 };
+        (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
+    };
+    squared(neighbour(-1, 0), neighbour(1, 0)) + squared(neighbour(0, -1), neighbour(0, 1))
 }
 
 /// Adds reference features to a view. `options` must be those of the refiner
@@ -262,14 +222,13 @@ pub fn with_references(
         .collect();
     let mut statistics = vec![ReferenceStatistics::default(); references.len()];
     for part in &parts {
-        for (sum, part) in statistics.iter_mut().zip(part) {
-            sum.add(part);
-        }
+        ReferenceStatistics::add_each(&mut statistics, part);
     }
     ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), statistics }
 }
 
-/// Fills a band of a conditioned view, starting at `first_row`; returns the references' statistics.
+/// Fills a band of rows of a conditioned view, starting at `first_row`; returns the references'
+/// statistics.
 fn fill_band(
     band: &mut [f32],
     first_row: usize,
@@ -277,14 +236,23 @@ fn fill_band(
     references: &[&KnownView],
     options: WarpOptions,
 ) -> Vec<ReferenceStatistics> {
-    let Image { width, height, .. } = rendered.view;
-    let rows = first_row..(first_row + BAND_ROWS).min(height);
-    let ReferenceFeatures { features, statistics } =
-        ReferenceFeatures::new(rendered, references, rows.clone(), options);
-    let view = &rendered.view.data[rows.start * width * INPUTS..];
+    let width = rendered.view.width;
+    let rows = first_row..first_row + band.len() / (width * REFERENCE_INPUTS);
+    let mut sums = vec![FeatureSums::default(); width * rows.len()];
+    let mut statistics = vec![ReferenceStatistics::default(); references.len()];
+    for (reference, own) in references.iter().zip(&mut statistics) {
+        let warped = warp(rendered, reference, &rows, options);
+        for (sums, pixel) in sums.iter_mut().zip(&warped) {
+            own.visible_pixels += usize::from(pixel.visibility > 0.0);
+            own.visibility += f64::from(pixel.visibility);
+            own.confidence += f64::from(pixel.confidence);
+            sums.add(pixel);
+        }
+    }
+    let view = &rendered.view.data[first_row * width * INPUTS..];
     for (i, pixel) in band.chunks_exact_mut(REFERENCE_INPUTS).enumerate() {
         pixel[..INPUTS].copy_from_slice(&view[i * INPUTS..(i + 1) * INPUTS]);
-        pixel[INPUTS..].copy_from_slice(&features[i]);
+        pixel[INPUTS..].copy_from_slice(&sums[i].features());
     }
     statistics
 }
@@ -420,14 +388,10 @@ mod tests {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
         let options = WarpOptions::default();
         let complete = with_references(&view.rendered, &[&reference], options).view;
-        let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, options);
-        assert_eq!(band.features.len(), 34 * WIDTH);
-        let expected = complete.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
-        for (found, expected) in band.features.iter().zip(expected) {
-            assert!(
-                found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5),
-                "{found:?} {expected:?}"
-            );
+        let mut band = vec![0.0; 34 * WIDTH * REFERENCE_INPUTS];
+        fill_band(&mut band, 7, &view.rendered, &[&reference], options);
+        for (found, expected) in band.iter().zip(&complete.data[7 * WIDTH * REFERENCE_INPUTS..]) {
+            assert!((found - expected).abs() < 1e-5, "{found} {expected}");
         }
     }
 }

@@ -78,6 +78,11 @@ impl Input {
     pub fn optional(kinds: &[&str], summary: &str) -> Self {
         Self { optional: true, ..Self::required(kinds, summary) }
     }
+
+    /// Returns the inputs of a sink: the record of a run, `run`.
+    pub fn run(summary: &str) -> Vec<(&'static str, Self)> {
+        vec![("run", Self::required(&["run"], summary))]
+    }
 }
 
 /// Artifact that a stage creates.

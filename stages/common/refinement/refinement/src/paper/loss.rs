@@ -79,7 +79,7 @@ impl PerceptualLoss {
 
     /// Computes the loss of images in -1..1 (count × 3 × rows × columns).
     pub(crate) fn distance(&self, found: &Tensor, truth: &Tensor) -> Result<Tensor, TchError> {
-        let mut sum = None::<Tensor>;
+        let mut sum = Tensor::from(0f32);
         let features = self.features(found)?;
         let expected = tch::no_grad(|| self.features(truth))?;
         for (i, (a, b)) in features.iter().zip(&expected).enumerate() {
@@ -89,13 +89,10 @@ impl PerceptualLoss {
                 1.0
             };
             let weight = BLOCK_WEIGHTS[i] / scale;
-            let difference = a.f_sub(b)?.f_abs()?.f_mean(Kind::Float)?.f_mul_scalar(weight)?;
-            sum = Some(match sum {
-                Some(sum) => sum.f_add(&difference)?,
-                None => difference,
-            });
+            let difference = a.f_sub(b)?.f_abs()?.f_mean(Kind::Float)?;
+            sum = sum.f_add(&difference.f_mul_scalar(weight)?)?;
         }
-        sum.ok_or_else(|| TchError::Shape("no block to compare".to_owned()))
+        Ok(sum)
     }
 
     /// Returns the features of images in -1..1 in every block that is compared.

@@ -8,8 +8,7 @@
 //! * [`PaperRefiner`]: the network (maximum over references as in Choi et al. 2019, "Extreme
 //!   View Synthesis"; batch normalisation, tanh). [`PaperRefiner::refine`] redraws a view in
 //!   overlapping patches and blends them; depth gives the positions of the reference patches.
-//! * [`PaperTrainer`], [`PaperTrainingOptions`]: training with L1 and, if VGG-19's weights are
-//!   given, [`PerceptualLoss`].
+//! * [`PaperTrainer`]: training with L1 and, if VGG-19's weights are given, [`PerceptualLoss`].
 //!
 //! Colours are display-encoded sRGB composited on the background, 0..1 outside and -1..1 inside.
 //! Faults of the authors' code are not repeated: that code takes reference patches from the first
@@ -33,4 +32,4 @@ mod trainer;
 
 pub use loss::PerceptualLoss;
 pub use network::PaperRefiner;
-pub use trainer::{PaperTrainer, PaperTrainingOptions};
+pub use trainer::PaperTrainer;

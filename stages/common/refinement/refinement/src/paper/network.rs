@@ -16,8 +16,7 @@ pub struct PaperRefiner {
 /// after the last layer of the decoder, otherwise ReLU.
 #[derive(Debug)]
 struct ConvLayer {
-    /// Tensors in the order of [`LayerTensor::ALL`]; without batch normalisation only the first
-    /// two.
+    /// Tensors in the order of [`TENSORS`]; without batch normalisation only the first two.
     tensors: Vec<Tensor>,
     stride: i64,
 }
@@ -52,6 +51,13 @@ const DECODER: [LayerSpec; 12] = [
     (Some(1), Some(1), 1, true),
     (Some(1), None, 1, false),
 ];
+/// Names of a layer's tensors in a weights file: kernel, bias, and those of batch normalisation, of
+/// which the last two are running statistics.
+const TENSORS: [&str; 6] = ["weight", "bias", SCALE, "norm.bias", "norm.running_mean", VARIANCE];
+const SCALE: &str = "norm.weight";
+const VARIANCE: &str = "norm.running_var";
+/// Number of a layer's tensors that are trainable, which come first.
+const TRAINABLE: usize = 4;
 /// Indices of the encoder layers whose features the decoder takes.
 const TAPS: [usize; 4] = [1, 3, 5, 6];
 /// Number of colour channels.
@@ -72,22 +78,17 @@ impl PaperRefiner {
     /// batch normalisation around 1). The published width is 128.
     pub fn new(width: u32, seed: u64) -> Result<Self, RefinementError> {
         let mut number = 0;
-        Self::build(width, |_, shape, kind| {
+        Self::build(width, |name, shape| {
             number += 1;
             let mut rng = CounterRng::new(seed, WEIGHTS_STREAM, number);
             let count = shape.iter().product::<i64>();
             let inputs = shape[1..].iter().product::<i64>() as f64;
-            let values: Vec<f32> = match kind {
-                LayerTensor::Kernel => {
-                    (0..count).map(|_| ((2.0 / inputs).sqrt() * rng.normal()) as f32).collect()
-                }
-                LayerTensor::Scale => {
-                    (0..count).map(|_| (1.0 + 0.02 * rng.normal()) as f32).collect()
-                }
-                LayerTensor::Variance => vec![1.0; count as usize],
-                LayerTensor::Bias | LayerTensor::Shift | LayerTensor::Mean => {
-                    vec![0.0; count as usize]
-                }
+            let values: Vec<f32> = if shape.len() > 1 {
+                (0..count).map(|_| ((2.0 / inputs).sqrt() * rng.normal()) as f32).collect()
+            } else if name.ends_with(SCALE) {
+                (0..count).map(|_| (1.0 + 0.02 * rng.normal()) as f32).collect()
+            } else {
+                vec![if name.ends_with(VARIANCE) { 1.0 } else { 0.0 }; count as usize]
             };
             Ok(Tensor::f_from_slice(&values)?.f_reshape(shape)?)
         })
@@ -101,7 +102,7 @@ impl PaperRefiner {
             return Err(RefinementError::Unusable(problem));
         }
         let weights = Weights::read(path)?;
-        Self::build(width, |name, shape, _| Ok(weights.tensor(name, shape)?))
+        Self::build(width, |name, shape| Ok(weights.tensor(name, shape)?))
     }
 
     /// Writes the weights.
@@ -114,10 +115,10 @@ impl PaperRefiner {
         self.parameters().map(|p| p.numel()).sum()
     }
 
-    /// Builds a network from tensors that `tensor` returns by name, shape and kind.
+    /// Builds a network from tensors that `tensor` returns by name and shape.
     fn build(
         width: u32,
-        mut tensor: impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
+        mut tensor: impl FnMut(&str, &[i64]) -> Result<Tensor, RefinementError>,
     ) -> Result<Self, RefinementError> {
         let encoder = build_layers("encoder", &ENCODER, width, &mut tensor)?;
         let decoder = build_layers("decoder", &DECODER, width, &mut tensor)?;
@@ -129,8 +130,8 @@ impl PaperRefiner {
         let mut all = Vec::new();
         for (name, layers) in [("encoder", &self.encoder), ("decoder", &self.decoder)] {
             for (i, layer) in layers.iter().enumerate() {
-                for (kind, tensor) in layer.tensors() {
-                    all.push((format!("{name}.{i}.{}", kind.name()), tensor));
+                for (part, tensor) in TENSORS.iter().zip(&layer.tensors) {
+                    all.push((format!("{name}.{i}.{part}"), tensor.shallow_clone()));
                 }
             }
         }
@@ -139,12 +140,9 @@ impl PaperRefiner {
 
     /// Returns handles to the trainable parameters.
     pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
-        self.encoder
-            .iter()
-            .chain(&self.decoder)
-            .flat_map(ConvLayer::tensors)
-            .filter(|(kind, _)| kind.is_trainable())
-            .map(|(_, t)| t)
+        let layers = self.encoder.iter().chain(&self.decoder);
+        let tensors = layers.flat_map(|layer| &layer.tensors);
+        tensors.filter(|tensor| tensor.requires_grad()).map(Tensor::shallow_clone)
     }
 
     /// Returns another handle to the same tensors, for another thread.
@@ -206,19 +204,18 @@ fn build_layers(
     name: &str,
     specs: &[LayerSpec],
     width: u32,
-    tensor: &mut impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
+    tensor: &mut impl FnMut(&str, &[i64]) -> Result<Tensor, RefinementError>,
 ) -> Result<Vec<ConvLayer>, RefinementError> {
     let mut layers = Vec::with_capacity(specs.len());
     for (i, &(inputs, outputs, stride, normalised)) in specs.iter().enumerate() {
         let [inputs, outputs] = [inputs, outputs]
             .map(|multiple| multiple.map_or(COLOURS, |multiple| multiple * i64::from(width)));
-        let kinds = if normalised { &LayerTensor::ALL[..] } else { &LayerTensor::ALL[..2] };
-        let mut tensors = Vec::with_capacity(kinds.len());
-        for &kind in kinds {
+        let mut tensors = Vec::with_capacity(TENSORS.len());
+        for (k, part) in TENSORS.iter().take(if normalised { 6 } else { 2 }).enumerate() {
             let kernel_shape = [outputs, inputs, 3, 3];
-            let shape = if kind == LayerTensor::Kernel { &kernel_shape[..] } else { &[outputs] };
-            let tensor = tensor(&format!("{name}.{i}.{}", kind.name()), shape, kind)?;
-            tensors.push(tensor.set_requires_grad(kind.is_trainable()));
+            let shape = if k == 0 { &kernel_shape[..] } else { &[outputs] };
+            let tensor = tensor(&format!("{name}.{i}.{part}"), shape)?;
+            tensors.push(tensor.set_requires_grad(k < TRAINABLE));
         }
         layers.push(ConvLayer { tensors, stride });
     }
@@ -237,39 +234,6 @@ fn max_over_references(features: &Tensor, count: i64) -> Result<Tensor, TchError
         return Err(TchError::Shape("expected features of four dimensions".to_owned()));
     };
     features.f_reshape([count, all / count.max(1), channels, rows, columns])?.f_amax([1], false)
-}
-
-/// Kind of a layer's tensor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum LayerTensor {
-    Kernel,
-    Bias,
-    Scale,
-    Shift,
-    Mean,
-    Variance,
-}
-
-impl LayerTensor {
-    const ALL: [Self; 6] =
-        [Self::Kernel, Self::Bias, Self::Scale, Self::Shift, Self::Mean, Self::Variance];
-
-    /// Returns the name in a weights file.
-    fn name(self) -> &'static str {
-        match self {
-            Self::Kernel => "weight",
-            Self::Bias => "bias",
-            Self::Scale => "norm.weight",
-            Self::Shift => "norm.bias",
-            Self::Mean => "norm.running_mean",
-            Self::Variance => "norm.running_var",
-        }
-    }
-
-    /// Returns whether the tensor is trainable, not a running statistic.
-    fn is_trainable(self) -> bool {
-        !matches!(self, Self::Mean | Self::Variance)
-    }
 }
 
 impl ConvLayer {
@@ -294,11 +258,6 @@ impl ConvLayer {
             EPSILON,
             false,
         )
-    }
-
-    /// Returns handles to the layer's tensors with their kinds.
-    fn tensors(&self) -> impl Iterator<Item = (LayerTensor, Tensor)> {
-        LayerTensor::ALL.into_iter().zip(self.tensors.iter().map(Tensor::shallow_clone))
     }
 
     /// Returns another handle to the same tensors.

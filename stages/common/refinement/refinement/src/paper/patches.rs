@@ -31,19 +31,15 @@ impl PaperRefiner {
         max_references: usize,
     ) -> Result<Image, RefinementError> {
         let view = &rendered.view;
-        if view.width < PATCH_PIXELS || view.height < PATCH_PIXELS {
-            let reason = format!(
-                "{}×{} pixels; the paper's network needs at least {PATCH_PIXELS}×{PATCH_PIXELS}",
-                view.width, view.height
-            );
-            return Err(RefinementError::view(&rendered.camera.name, reason));
-        }
-        if let Some(small) = references
-            .iter()
-            .find(|r| r.truth.width < PATCH_PIXELS || r.truth.height < PATCH_PIXELS)
-        {
-            let reason = format!("reference of fewer than {PATCH_PIXELS}×{PATCH_PIXELS} pixels");
-            return Err(RefinementError::view(&small.rendered.camera.name, reason));
+        let images = references.iter().map(|known| (&known.rendered, &known.truth));
+        for (rendered, image) in images.chain([(rendered, view)]) {
+            if image.width < PATCH_PIXELS || image.height < PATCH_PIXELS {
+                let reason = format!(
+                    "{}×{} pixels; the paper's network needs at least {PATCH_PIXELS}×{PATCH_PIXELS}",
+                    image.width, image.height
+                );
+                return Err(RefinementError::view(&rendered.camera.name, reason));
+            }
         }
         // Tensors aren't `Sync`, so each task takes handles of its own.
         let tasks: Vec<(Corner, Self)> = patch_starts(view.height)

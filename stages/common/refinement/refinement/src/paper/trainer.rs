@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use crate::{KnownView, RefinementError, Training};
+use crate::{KnownView, RefinementError, Training, TrainingOptions};
 use nets::Adam;
 use numerics::CounterRng;
 use pixels::Image;
@@ -11,30 +11,14 @@ use super::network::{PATCH_MULTIPLE, PaperRefiner, patch_tensor};
 use super::patches::PATCH_PIXELS;
 use super::perspective::Perspective;
 
-/// Options for training a [`PaperRefiner`].
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PaperTrainingOptions {
-    /// Total number of steps; 46,875 as published.
-    pub steps: u64,
-    /// Number of patches per step; 32 as published.
-    pub batch_size: usize,
-    /// Side of a patch in pixels, a multiple of 8; 64 as published.
-    pub patch_size: usize,
-    /// Number of reference patches per patch; 8 as published.
-    pub references: usize,
-    /// Learning rate; 5e-4 as published.
-    pub learning_rate: f64,
-    /// Seed of all random numbers.
-    pub seed: u64,
-}
-
 /// Trains a [`PaperRefiner`] on references and their rendered views. A patch is cut from both after
 /// a warp by one of 200 random perspectives. Its reference patches come from a window of fixed size
 /// around the patch in the unwarped reference. The reported loss is the mean absolute error of
-/// colours in -1..1.
+/// colours in -1..1. As published, 46,875 steps have 32 patches of 64 pixels, each with 8 reference
+/// patches, and the learning rate is 5e-4.
 pub struct PaperTrainer {
     network: PaperRefiner,
-    options: PaperTrainingOptions,
+    options: TrainingOptions,
     perceptual: Option<PerceptualLoss>,
     adam: Adam,
 }
@@ -51,11 +35,38 @@ impl PaperTrainer {
     /// Creates a trainer of `network`.
     pub fn new(
         network: PaperRefiner,
-        options: PaperTrainingOptions,
+        options: TrainingOptions,
         perceptual: Option<PerceptualLoss>,
     ) -> Result<Self, RefinementError> {
         let adam = Adam::new(network.parameters())?;
         Ok(Self { network, options, perceptual, adam })
+    }
+
+    /// Fails if the network can't halve patches three times, if a batch is too small to be
+    /// normalised, or if an example is smaller than a patch, in training or in
+    /// [`PaperRefiner::refine`].
+    pub fn check(options: &TrainingOptions, examples: &[KnownView]) -> Result<(), RefinementError> {
+        let size = options.patch_size;
+        if size == 0 || !size.is_multiple_of(PATCH_MULTIPLE) {
+            return Err(RefinementError::Unusable(format!(
+                "a patch size of {size} pixels is not a multiple of {PATCH_MULTIPLE}"
+            )));
+        }
+        // The variance of a single value isn't defined.
+        if options.batch_size * (size / PATCH_MULTIPLE).pow(2) < 2 {
+            return Err(RefinementError::Unusable(format!(
+                "a batch of one patch of {size}×{size} pixels has a single value per channel, \
+                which batch normalisation does not allow; raise batch_size or patch_size"
+            )));
+        }
+        let size = size.max(PATCH_PIXELS);
+        for KnownView { rendered, truth } in examples {
+            if truth.width < size || truth.height < size {
+                let reason = format!("smaller than a patch of {size}×{size} pixels");
+                return Err(RefinementError::view(&rendered.camera.name, reason));
+            }
+        }
+        Ok(())
     }
 
     /// Returns the network in its current state.
@@ -70,24 +81,20 @@ impl Training for PaperTrainer {
     }
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
-        let PaperTrainingOptions { steps, batch_size, patch_size, references, learning_rate, seed } =
+        let TrainingOptions { steps, batch_size, patch_size, references, learning_rate, .. } =
             self.options;
         if self.steps() >= steps {
             return Ok(None);
         }
-        let mut samples = BatchSamples::default();
+        let mut batch = Batch::default();
         for i in 0..batch_size as u64 {
-            let number = self.steps() * batch_size as u64 + i;
-            let mut rng = CounterRng::new(seed, PATCHES, number);
-            let index = rng.below(examples.len() as u64);
-            TrainingPatch::draw(&examples[index as usize], index, &self.options, &mut rng)
-                .append(&mut samples);
+            batch.add_patch(self.steps() * batch_size as u64 + i, &self.options, examples);
         }
-        let BatchSamples { rendered, truth, references: reference_samples } = samples;
-        let rendered = patch_tensor(&rendered, batch_size, patch_size)?.f_contiguous()?;
-        let truth = patch_tensor(&truth, batch_size, patch_size)?.f_contiguous()?;
-        let references = patch_tensor(&reference_samples, batch_size * references, patch_size)?
-            .f_contiguous()?;
+        let tensor =
+            |samples: &[f32], patches| patch_tensor(samples, patches, patch_size)?.f_contiguous();
+        let rendered = tensor(&batch.rendered, batch_size)?;
+        let truth = tensor(&batch.truth, batch_size)?;
+        let references = tensor(&batch.references, batch_size * references)?;
         let redrawn = self.network.forward(&rendered, &references, true)?;
         let (loss, error) = loss(&redrawn, &truth, self.perceptual.as_ref())?;
         let parameters: Vec<Tensor> = self.network.parameters().collect();
@@ -127,37 +134,26 @@ pub(crate) fn loss(
 
 /// Colours of a batch's patches in -1..1: as rendered, ground truth, and reference patches.
 #[derive(Default)]
-struct BatchSamples {
+struct Batch {
     rendered: Vec<f32>,
     truth: Vec<f32>,
     references: Vec<f32>,
 }
 
-/// Patch of a warped example, with its reference patches.
-struct TrainingPatch<'a> {
-    example: &'a KnownView,
-    warp: Perspective,
-    size: usize,
-    corner: (usize, usize),
-    /// Corners of the reference patches in the unwarped image.
-    references: Vec<(usize, usize)>,
-}
-
-impl<'a> TrainingPatch<'a> {
-    /// Draws a patch of the example with index `index`, and its reference patches.
-    fn draw(
-        example: &'a KnownView,
-        index: u64,
-        options: &PaperTrainingOptions,
-        rng: &mut CounterRng,
-    ) -> Self {
-        let (width, height) = (example.truth.width, example.truth.height);
+impl Batch {
+    /// Draws the `number`-th patch of the training run, with its reference patches.
+    fn add_patch(&mut self, number: u64, options: &TrainingOptions, examples: &[KnownView]) {
+        let mut rng = CounterRng::new(options.seed, PATCHES, number);
+        let index = rng.below(examples.len() as u64);
+        let KnownView { rendered, truth } = &examples[index as usize];
+        let (width, height) = (truth.width, truth.height);
+        let identity = Perspective::identity(width, height);
         let perspective = rng.below(PERSPECTIVES_PER_IMAGE);
         // The generator depends only on the perspective's number, so an image always has the same
         // 200.
         let number = index * PERSPECTIVES_PER_IMAGE + perspective;
         let warp = if perspective == 0 {
-            Perspective::identity(width, height)
+            identity
         } else {
             Perspective::draw(width, height, &mut CounterRng::new(options.seed, WARPS, number))
         };
@@ -165,38 +161,31 @@ impl<'a> TrainingPatch<'a> {
         let [left, top, right, bottom] = warp.filled;
         let (right, bottom) = (right.saturating_sub(size), bottom.saturating_sub(size));
         // A patch that is larger than the warped content also covers black pixels around it.
-        let corner =
-            (draw_between(left.min(right), right, rng), draw_between(top.min(bottom), bottom, rng));
+        let (x, y) = (
+            draw_between(left.min(right), right, &mut rng),
+            draw_between(top.min(bottom), bottom, &mut rng),
+        );
+        append_patch(&rendered.view, warp, (x, y), size, &mut self.rendered);
+        append_patch(truth, warp, (x, y), size, &mut self.truth);
         let (right, bottom) = (width.saturating_sub(size), height.saturating_sub(size));
-        let references = (0..options.references)
-            .map(|_| (draw_near(corner.0, right, rng), draw_near(corner.1, bottom, rng)))
-            .collect();
-        Self { example, warp, size, corner, references }
-    }
-
-    /// Appends the patch and its reference patches to a batch.
-    fn append(&self, samples: &mut BatchSamples) {
-        let KnownView { rendered, truth } = self.example;
-        self.append_patch(&rendered.view, self.warp, self.corner, &mut samples.rendered);
-        self.append_patch(truth, self.warp, self.corner, &mut samples.truth);
-        let identity = Perspective::identity(truth.width, truth.height);
-        for &corner in &self.references {
-            self.append_patch(truth, identity, corner, &mut samples.references);
+        for _ in 0..options.references {
+            let corner = (draw_near(x, right, &mut rng), draw_near(y, bottom, &mut rng));
+            append_patch(truth, identity, corner, size, &mut self.references);
         }
     }
+}
 
-    /// Warps an image and appends its patch with corner (x, y), row by row, in -1..1.
-    fn append_patch(
-        &self,
-        image: &Image,
-        warp: Perspective,
-        (x, y): (usize, usize),
-        samples: &mut Vec<f32>,
-    ) {
-        for row in y..y + self.size {
-            for column in x..x + self.size {
-                samples.extend(warp.colour(image, column, row).map(|v| 2.0 * v - 1.0));
-            }
+/// Warps an image and appends its patch with corner (x, y), row by row, in -1..1.
+fn append_patch(
+    image: &Image,
+    warp: Perspective,
+    (x, y): (usize, usize),
+    size: usize,
+    samples: &mut Vec<f32>,
+) {
+    for row in y..y + size {
+        for column in x..x + size {
+            samples.extend(warp.colour(image, column, row).map(|v| 2.0 * v - 1.0));
         }
     }
 }
@@ -210,35 +199,6 @@ fn draw_between(low: usize, high: usize, rng: &mut CounterRng) -> usize {
 fn draw_near(start: usize, last: usize, rng: &mut CounterRng) -> usize {
     let low = start.saturating_sub(MAX_REFERENCE_OFFSET_PIXELS).min(last);
     draw_between(low, (start + MAX_REFERENCE_OFFSET_PIXELS).min(last), rng)
-}
-
-impl PaperTrainingOptions {
-    /// Fails if the network can't halve patches three times, if a batch is too small to be
-    /// normalised, or if an example is smaller than a patch, in training or in
-    /// [`PaperRefiner::refine`].
-    pub fn check(&self, examples: &[KnownView]) -> Result<(), RefinementError> {
-        let size = self.patch_size;
-        if size == 0 || !size.is_multiple_of(PATCH_MULTIPLE) {
-            return Err(RefinementError::Unusable(format!(
-                "a patch size of {size} pixels is not a multiple of {PATCH_MULTIPLE}"
-            )));
-        }
-        // The variance of a single value isn't defined.
-        if self.batch_size * (size / PATCH_MULTIPLE).pow(2) < 2 {
-            return Err(RefinementError::Unusable(format!(
-                "a batch of one patch of {size}×{size} pixels has a single value per channel, \
-                which batch normalisation does not allow; raise batch_size or patch_size"
-            )));
-        }
-        let size = size.max(PATCH_PIXELS);
-        for KnownView { rendered, truth } in examples {
-            if truth.width < size || truth.height < size {
-                let reason = format!("smaller than a patch of {size}×{size} pixels");
-                return Err(RefinementError::view(&rendered.camera.name, reason));
-            }
-        }
-        Ok(())
-    }
 }
 
 #[cfg(test)]
@@ -274,7 +234,7 @@ mod tests {
         KnownView { rendered, truth: Image::new(48, 40, 3, truth) }
     }
 
-    const OPTIONS: PaperTrainingOptions = PaperTrainingOptions {
+    const OPTIONS: TrainingOptions = TrainingOptions {
         steps: 60,
         batch_size: 4,
         patch_size: 16,
@@ -315,13 +275,13 @@ mod tests {
     #[test]
     fn patches_must_fit() {
         let error = |batch_size, patch_size| {
-            let options = PaperTrainingOptions { batch_size, patch_size, ..OPTIONS };
-            options.check(&[example()]).unwrap_err().to_string()
+            let options = TrainingOptions { batch_size, patch_size, ..OPTIONS };
+            PaperTrainer::check(&options, &[example()]).unwrap_err().to_string()
         };
         assert!(error(4, 72).contains("72×72") && error(4, 20).contains("multiple of 8"));
         assert!(error(1, 8).contains("single value"));
         // Scoring the trained network needs views of 64×64 pixels, whatever the patches are.
         assert!(error(2, 8).contains("64×64") && error(1, 16).contains("64×64"));
-        OPTIONS.check(&[]).unwrap();
+        PaperTrainer::check(&OPTIONS, &[]).unwrap();
     }
 }
