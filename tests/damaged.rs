@@ -162,7 +162,7 @@ const DAMAGES: &[Damage] = &[
         },
         &[
             "frame 2 (train/._r_2.png)",
-            "._r_2.png is named like editor and system files, which are ignored; rename the file",
+            "._r_2.png is named like editor and system files, which are ignored; restore or rename the file",
         ],
     ),
 ];

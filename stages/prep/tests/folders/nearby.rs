@@ -95,7 +95,7 @@ fn place_cases() -> Vec<Case> {
                 write_binary_images(folder);
             },
             Expected::Refused(
-                "dataset: DIR/sparse/0/cameras.bin: file not found next to images.bin; copy all files of the model",
+                "dataset: DIR/sparse/0/cameras.bin: file not found; copy all files of the model",
             ),
         ),
         case(

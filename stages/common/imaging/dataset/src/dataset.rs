@@ -3,7 +3,8 @@ use std::collections::BTreeSet;
 use artifact::{WARNING, format_count};
 use scene::{Camera, Intrinsics};
 
-use crate::error::{DatasetError, Reason};
+use crate::error::DatasetError;
+use crate::file_status::path_text;
 use crate::format::Format;
 use crate::frame::{Frame, Turn};
 use crate::split::Split;
@@ -77,9 +78,11 @@ impl Dataset {
         for frame in self.frames.iter_mut().filter(|f| f.has_distortion()) {
             let distortion = frame.lens_intrinsics.distortion;
             let pinhole = frame.lens_intrinsics.pinhole().ok_or_else(|| {
-                let problem = format!("lens distortion {distortion} leaves no pinhole image");
-                let reason = Reason::new(format!("{problem}; are its coefficients right?"));
-                DatasetError::format(&frame.image, reason)
+                DatasetError::Invalid(format!(
+                    "{}: lens distortion {distortion} leaves no pinhole image; are its \
+                    coefficients right?",
+                    path_text(&frame.image)
+                ))
             })?;
             frame.pinhole = Some(pinhole);
             if distortion.is_fisheye() {

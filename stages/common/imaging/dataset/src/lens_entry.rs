@@ -1,9 +1,9 @@
+use anyhow::{anyhow, bail};
 use artifact::shortened;
 use scene::Distortion;
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::error::Reason;
 use crate::number::Number;
 
 /// Names of camera models; case is ignored.
@@ -16,7 +16,7 @@ const FISHEYE_MODELS: [&str; 5] =
 const PANORAMAS: [&str; 2] = ["equirectangular", "latlong"];
 
 /// Lens of all frames of a `transforms.json`, or of one, with instant-ngp's and nerfstudio's keys.
-#[derive(Clone, Default, Deserialize)]
+#[derive(Deserialize)]
 pub(crate) struct LensEntry {
     camera_model: Option<String>,
     pub(crate) camera_angle_x: Option<Number>,
@@ -44,53 +44,12 @@ pub(crate) struct LensEntry {
 }
 
 impl LensEntry {
-    /// Returns this entry, completed from `other`. An angle of view of this entry takes the place of
-    /// the other's focal length.
-    pub(crate) fn or(&self, other: &Self) -> Self {
-        macro_rules! both {
-            ($($name:ident),*) => {
-                Self { $($name: self.$name.clone().or_else(|| other.$name.clone())),* }
-            };
-        }
-        let mut entry = both!(
-            camera_model,
-            camera_angle_x,
-            camera_angle_y,
-            fl_x,
-            fl_y,
-            cx,
-            cy,
-            w,
-            h,
-            k1,
-            k2,
-            k3,
-            k4,
-            k5,
-            k6,
-            p1,
-            p2,
-            is_fisheye,
-            equirectangular,
-            latlong,
-            orthographic,
-            ftheta_p0
-        );
-        if self.camera_angle_x.is_some() {
-            entry.fl_x = self.fl_x;
-        }
-        if self.camera_angle_y.is_some() {
-            entry.fl_y = self.fl_y;
-        }
-        entry
-    }
-
     /// Returns the distortion; fails for a model that isn't supported. For a fisheye lens k1 to k4
     /// are OpenCV's. For a perspective lens k4 is Brown's fourth radial term, as in nerfstudio,
     /// unless the model is OpenCV's rational one, the only one with k5 and k6.
-    pub(crate) fn distortion(&self) -> Result<Distortion, Reason> {
+    pub(crate) fn distortion(&self) -> anyhow::Result<Distortion> {
         if let Some(model) = self.unsupported_projection() {
-            return Err(unsupported_model(model));
+            bail!(unsupported_model(model));
         }
         let [k1, k2, k3, k4, k5, k6, p1, p2] =
             [self.k1, self.k2, self.k3, self.k4, self.k5, self.k6, self.p1, self.p2]
@@ -105,7 +64,7 @@ impl LensEntry {
         } else if is_in(&FISHEYE_MODELS) {
             (true, false)
         } else {
-            return Err(unsupported_model(model));
+            bail!(unsupported_model(model));
         };
         let radial = [k1, k2, k3, k4];
         Ok(if is_fisheye {
@@ -133,8 +92,8 @@ impl LensEntry {
     }
 }
 
-/// Returns the reason for a camera model that isn't supported.
-fn unsupported_model(model: &str) -> Reason {
+/// Returns the error for a camera model that isn't supported.
+fn unsupported_model(model: &str) -> anyhow::Error {
     let remedy = if PANORAMAS.iter().any(|name| name.eq_ignore_ascii_case(model)) {
         "cut the panoramas into views and estimate their cameras: ns-process-data images \
         --camera-type equirectangular"
@@ -144,5 +103,5 @@ fn unsupported_model(model: &str) -> Reason {
         let known = known.join(", ");
         format!("undistort the images first (colmap image_undistorter); supported are {known}")
     };
-    Reason::new(format!("camera_model {:?} is not supported; {remedy}", shortened(model)))
+    anyhow!("camera_model {:?} is not supported; {remedy}", shortened(model))
 }

@@ -1,75 +1,45 @@
-use std::fmt;
-
-use serde::de::{Deserialize, Deserializer, Error, Unexpected, Visitor};
+use artifact::shortened;
+use serde::Deserialize;
+use serde_json::Value;
 
 /// Number in a JSON file, including Python's non-finite numbers, which [`quote_python_numbers`] has
 /// quoted.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(try_from = "Value")]
 pub(crate) struct Number(pub(crate) f64);
 
 /// Python's words for numbers that JSON lacks.
 const WORDS: [(&str, f64); 3] =
     [("NaN", f64::NAN), ("-Infinity", f64::NEG_INFINITY), ("Infinity", f64::INFINITY)];
 
-impl<'de> Deserialize<'de> for Number {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(NumberOrWord)
-    }
-}
+impl TryFrom<Value> for Number {
+    type Error = String;
 
-struct NumberOrWord;
-
-impl Visitor<'_> for NumberOrWord {
-    type Value = Number;
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("a number")
-    }
-
-    fn visit_f64<E: Error>(self, value: f64) -> Result<Number, E> {
-        Ok(Number(value))
-    }
-
-    fn visit_u64<E: Error>(self, value: u64) -> Result<Number, E> {
-        Ok(Number(value as f64))
-    }
-
-    fn visit_i64<E: Error>(self, value: i64) -> Result<Number, E> {
-        Ok(Number(value as f64))
-    }
-
-    fn visit_str<E: Error>(self, text: &str) -> Result<Number, E> {
-        let word = WORDS.iter().find(|(word, _)| *word == text);
-        word.map(|(_, value)| Number(*value))
-            .ok_or_else(|| E::invalid_type(Unexpected::Str(text), &self))
+    fn try_from(value: Value) -> Result<Self, String> {
+        let word = WORDS.iter().find(|(word, _)| value == *word).map(|(_, number)| *number);
+        let number = value.as_f64().or(word).map(Self);
+        number.ok_or_else(|| format!("expected a number, found {}", shortened(&value.to_string())))
     }
 }
 
 /// Puts quotes around Python's `NaN` and `Infinity` outside strings, so that JSON with them can be
 /// parsed; `None` if there are none.
 pub(crate) fn quote_python_numbers(json: &str) -> Option<String> {
-    let (mut text, mut rest, mut in_string) = (String::with_capacity(json.len() + 64), json, false);
-    while let Some(next) = rest.chars().next() {
-        let word = WORDS
-            .iter()
-            .find(|(word, _)| !in_string && rest.starts_with(word))
-            .map(|(word, _)| *word);
-        let taken = match (word, next) {
-            (Some(word), _) => {
-                text.push_str(&format!("\"{word}\""));
-                rest = &rest[word.len()..];
-                continue;
-            }
+    let (mut text, mut in_string) = (String::with_capacity(json.len() + 64), false);
+    for (i, part) in json.split('"').enumerate() {
+        if i > 0 {
+            text.push('"');
+        }
+        if in_string {
+            text.push_str(part);
             // An escaped quote doesn't end the string.
-            (None, '\\') if in_string => 1 + rest[1..].chars().next().map_or(0, char::len_utf8),
-            (None, '"') => {
-                in_string = !in_string;
-                1
-            }
-            (None, other) => other.len_utf8(),
-        };
-        text.push_str(&rest[..taken]);
-        rest = &rest[taken..];
+            let backslashes = part.len() - part.trim_end_matches('\\').len();
+            in_string = !backslashes.is_multiple_of(2);
+        } else {
+            let part = part.replace("NaN", "\"NaN\"").replace("Infinity", "\"Infinity\"");
+            text.push_str(&part.replace("-\"Infinity\"", "\"-Infinity\""));
+            in_string = true;
+        }
     }
     (text.len() > json.len()).then_some(text)
 }

@@ -2,6 +2,7 @@ use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
+use anyhow::bail;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use pixels::{
@@ -10,7 +11,6 @@ use pixels::{
 };
 use scene::{Intrinsics, undistort_image};
 
-use crate::error::{DatasetError, Reason};
 use crate::frame::{Frame, Turn};
 use crate::jpeg::{Completeness, END_MARKER, check_completeness};
 use crate::unsupported::unsupported_error;
@@ -100,7 +100,7 @@ pub(crate) fn read_header(path: &Path) -> Result<ImageHeader, PixelError> {
 
 /// Resizes a camera to an image, as stored or as turned by EXIF. Returns the resized intrinsics and
 /// the treatment of the EXIF orientation. Fails if the aspect ratios differ.
-pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> Result<(Intrinsics, Turn), Reason> {
+pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> anyhow::Result<(Intrinsics, Turn)> {
     let (width, height) = stored.size;
     let is_turned_fit = stored.is_sideways() && has_aspect_of(&k, height, width);
     let is_turned_exactly = stored.is_sideways() && (k.height, k.width) == stored.size;
@@ -114,10 +114,11 @@ pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> Result<(Intrinsi
     } else if is_turned_fit {
         Ok((k.resized(height, width), Turn::Upright))
     } else {
-        Err(Reason::new(format!(
+        bail!(
             "the image has {width}×{height} pixels, its camera {}×{}; aspect ratios must match",
-            k.width, k.height
-        )))
+            k.width,
+            k.height
+        )
     }
 }
 
@@ -242,33 +243,29 @@ const RGBA_BYTES: u64 = 4;
 /// 2 bytes each. Also counted for other JPEGs and for PNG, as an upper bound.
 const COEFFICIENT_BYTES: u64 = 6;
 
-/// Returns the peak memory in bytes while an image is read, estimated from the image's header.
-fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
-    if is_exr(path) {
-        let (width, height) = exr_size(path)?;
-        return Ok(exr_reading_bytes(path)? + RGBA_BYTES * (width * height) as u64);
-    }
-    let file = File::open(path).map_err(PixelError::io(path))?;
-    let decoder = decoder(BufReader::new(file), path)?;
-    let (width, height) = decoder.dimensions();
-    let pixels = u64::from(width) * u64::from(height);
-    Ok(decoder.total_bytes() + (RGBA_BYTES + COEFFICIENT_BYTES) * pixels)
-}
-
 impl Frame {
     /// Returns the peak memory in bytes during [`Frame::photograph`], estimated from the image's
     /// header.
-    pub fn reading_bytes(&self) -> Result<u64, DatasetError> {
-        Ok(reading_bytes(&self.image)?)
+    pub fn reading_bytes(&self) -> Result<u64, PixelError> {
+        let path = &self.image;
+        if is_exr(path) {
+            let (width, height) = exr_size(path)?;
+            return Ok(exr_reading_bytes(path)? + RGBA_BYTES * (width * height) as u64);
+        }
+        let file = File::open(path).map_err(PixelError::io(path))?;
+        let decoder = decoder(BufReader::new(file), path)?;
+        let (width, height) = decoder.dimensions();
+        let pixels = u64::from(width) * u64::from(height);
+        Ok(decoder.total_bytes() + (RGBA_BYTES + COEFFICIENT_BYTES) * pixels)
     }
 
     /// Reads the image of [`Frame::camera`], as taken or with its distortion removed.
-    pub fn photograph(&self) -> Result<Rgba8, DatasetError> {
+    pub fn photograph(&self) -> Result<Rgba8, PixelError> {
         Ok(self.photograph_and_clipping()?.0)
     }
 
     /// Reads [`Frame::photograph`], and counts its pixels brighter than 1.
-    pub fn photograph_and_clipping(&self) -> Result<(Rgba8, Clipping), DatasetError> {
+    pub fn photograph_and_clipping(&self) -> Result<(Rgba8, Clipping), PixelError> {
         let (image, clipping) = read_image(&self.image, self.turn == Turn::Upright)?;
         let k = self.lens_intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
@@ -276,7 +273,7 @@ impl Frame {
                 "image is {}×{} pixels, its camera {}×{}",
                 image.width, image.height, k.width, k.height
             );
-            return Err(PixelError::format(&self.image, reason).into());
+            return Err(PixelError::format(&self.image, reason));
         }
         Ok((self.without_distortion(image), clipping))
     }
@@ -285,7 +282,7 @@ impl Frame {
     /// ray. `None` if there is no mask file and every pixel has a ray. A mask file of a different
     /// size is resampled by nearest neighbour. In a file without bright pixels, all pixels that
     /// aren't black count as bright.
-    pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
+    pub fn mask(&self) -> Result<Option<Mask>, PixelError> {
         let lens = self.intrinsics().lens_mask();
         let Some(file) = &self.mask else { return Ok(lens) };
         let (mut image, _) = read_image(&file.path, self.turn == Turn::Upright)?;

@@ -201,7 +201,7 @@ fn the_largest_model_is_read_and_reported() {
     assert!(set.notes[1].contains("sparse/0 has 1, sparse/1 has 2"), "{:?}", set.notes);
 }
 
-fn read_texts(cameras: &str, images: &str) -> Result<Dataset, DatasetError> {
+fn read_texts(cameras: &str, images: &str) -> Result<Dataset, crate::DatasetError> {
     Dataset::read(folder("sparse/0", &text_files(cameras, images, POINTS)).path())
 }
 
@@ -281,7 +281,7 @@ fn unknown_model_numbers_are_named() {
     );
 }
 
-fn read_binaries(files: &[Vec<u8>; 3]) -> Result<Dataset, DatasetError> {
+fn read_binaries(files: &[Vec<u8>; 3]) -> Result<Dataset, crate::DatasetError> {
     let named = [
         ("cameras.bin", &files[0][..]),
         ("images.bin", &files[1][..]),

@@ -17,23 +17,29 @@ use std::path::{Path, PathBuf};
 
 use artifact::{PathError, relative_path};
 
-use crate::file_status::{FileProblem, FileStatus, file_status, path_text};
+use crate::file_status::{FileProblem, check_file, path_text};
 use crate::photograph::is_image_name;
 use crate::unsupported::is_unsupported_name;
 
 pub(crate) use listings::Listings;
-use matching::{Extensions, Tolerance, absolute_parts, candidates, parts};
-use steps::{Steps, StepsTaken};
+use matching::{Tolerance, absolute_parts, candidates, parts};
+use steps::{Step, Steps};
 
 /// Folder of photographs in most formats; reduced copies are in `images_2`, `images_4` and so on.
 const IMAGES: &str = "images";
 
 /// Error returned when a name doesn't determine a single file inside the folder.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, thiserror::Error)]
 pub(crate) enum LookupError {
     /// Path out of the folder, or an empty name.
-    #[error(transparent)]
+    #[error(
+        "{0}; name a file in the folder, or move the list of names to the folder above, and give \
+        that folder"
+    )]
     Path(#[from] PathError),
+    /// Name of no file, or of something that can't be read as a file.
+    #[error("{0}; restore or rename the file, or remove its entry")]
+    File(#[from] FileProblem),
     /// Name that two files match equally well; both paths are relative to the data set's folder.
     #[error(
         "{} and {} both match {name:?}; remove one of the two, or name it exactly",
@@ -43,13 +49,11 @@ pub(crate) enum LookupError {
     Ambiguous { name: String, first: PathBuf, second: PathBuf },
 }
 
-/// Result of a lookup.
-#[derive(Debug)]
-pub(crate) enum Located {
-    File(LocatedFile),
-    Missing(FileProblem),
-    /// Something that can't be read as a file.
-    Unusable(FileProblem),
+impl LookupError {
+    /// True if no file has the name.
+    pub(crate) fn is_missing(&self) -> bool {
+        matches!(self, Self::File(FileProblem::Missing(_)))
+    }
 }
 
 /// File found for a name. Both paths are relative to the data set's folder.
@@ -58,6 +62,12 @@ pub(crate) struct LocatedFile {
     pub(crate) path: PathBuf,
     /// Path that names the view: without the second of two extensions.
     pub(crate) label: PathBuf,
+}
+
+impl From<PathBuf> for LocatedFile {
+    fn from(path: PathBuf) -> Self {
+        Self { label: path.clone(), path }
+    }
 }
 
 /// Treatment of files that other names match literally.
@@ -92,8 +102,15 @@ impl ShortenedNames {
 /// Interpretation of a name as a path.
 struct Interpretation {
     path: PathBuf,
-    taken: StepsTaken,
-    extensions: Extensions,
+    /// Steps that lead to the path.
+    steps: Vec<Step>,
+}
+
+impl Interpretation {
+    /// True if the file may have any image extension: reduced copies often have another format.
+    fn has_any_extension(&self) -> bool {
+        self.steps.contains(&Step::Substitute)
+    }
 }
 
 /// Lookup of a data set's names.
@@ -184,40 +201,37 @@ impl Lookup {
     }
 
     /// Finds the file of a name, and records the steps that led there.
-    pub(crate) fn find(&mut self, name: &str) -> Result<Located, LookupError> {
+    pub(crate) fn find(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
         self.locate(name, ClaimedFiles::Excluded)
     }
 
     /// Finds the file of a name in a list that repeats names, which another name may have claimed.
-    pub(crate) fn find_repeated(&mut self, name: &str) -> Result<Located, LookupError> {
+    pub(crate) fn find_repeated(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
         self.locate(name, ClaimedFiles::Included)
     }
 
-    fn locate(&mut self, name: &str, claimed: ClaimedFiles) -> Result<Located, LookupError> {
+    fn locate(&mut self, name: &str, claimed: ClaimedFiles) -> Result<LocatedFile, LookupError> {
         let literal = self.literal_path(name);
         let mut missing = None;
         if let Ok(path) = &literal {
-            match file_status(&self.root().join(path), "an image") {
-                FileStatus::File if is_image_name(Path::new(name)) => {
-                    let (path, label) = (path.clone(), path.clone());
-                    return Ok(Located::File(LocatedFile { path, label }));
-                }
-                FileStatus::File => {}
-                FileStatus::Missing(problem) => missing = Some(problem),
-                FileStatus::Unusable(problem) => return Ok(Located::Unusable(problem)),
+            match check_file(&self.root().join(path), "an image") {
+                Ok(()) if is_image_name(Path::new(name)) => return Ok(path.clone().into()),
+                Ok(()) => {}
+                Err(problem @ FileProblem::Missing(_)) => missing = Some(problem),
+                Err(problem) => return Err(problem.into()),
             }
         }
-        if let Some((file, taken)) = self.search(name, claimed)? {
-            self.steps.record(name, &file.path, taken);
-            return Ok(Located::File(file));
+        if let Some((file, steps)) = self.search(name, claimed)? {
+            self.steps.record(name, &file.path, steps);
+            return Ok(file);
         }
         if let Some(path) = self.unsupported_file(name) {
-            return Ok(Located::File(LocatedFile { label: path.clone(), path }));
+            return Ok(path.into());
         }
         match (missing, literal) {
-            (Some(problem), _) => Ok(Located::Missing(problem)),
+            (Some(problem), _) => Err(problem.into()),
             (None, Err(error)) if absolute_parts(name).is_none() => Err(error.into()),
-            _ => Ok(Located::Missing(FileProblem::Other(format!(
+            _ => Err(LookupError::File(FileProblem::Missing(format!(
                 "no file in the data set matches the end of the absolute path {}",
                 path_text(Path::new(name))
             )))),
@@ -250,9 +264,9 @@ impl Lookup {
         &mut self,
         name: &str,
         claimed: ClaimedFiles,
-    ) -> Result<Option<(LocatedFile, StepsTaken)>, LookupError> {
+    ) -> Result<Option<(LocatedFile, Vec<Step>)>, LookupError> {
         let interpretations = self.interpretations(name);
-        for tolerance in Tolerance::STEPS {
+        for tolerance in Tolerance::all() {
             for interpretation in &interpretations {
                 match &self.matches(interpretation, tolerance, claimed)[..] {
                     [] => {}
@@ -272,34 +286,25 @@ impl Lookup {
 
     /// Returns the interpretations of a name, the most literal first.
     fn interpretations(&self, name: &str) -> Vec<Interpretation> {
-        let none = StepsTaken::default();
+        let mut paths = vec![(relative_path(name), Vec::new())];
+        if name.contains('\\') {
+            paths.push((relative_path(&name.replace('\\', "/")), vec![Step::Slashes]));
+        }
+        if let (Some(parts), Some(removed)) = (self.shortened.parts(name), self.removed) {
+            let tail = parts[removed.min(parts.len())..].join("/");
+            paths.push((relative_path(&tail), vec![Step::Tail]));
+        }
         let mut found = Vec::new();
-        if let Ok(path) = relative_path(name) {
-            found.push(self.interpretation(&path, none));
-        }
-        if name.contains('\\')
-            && let Ok(path) = relative_path(&name.replace('\\', "/"))
-        {
-            found.push(self.interpretation(&path, StepsTaken { slashes: true, ..none }));
-        }
-        if let (Some(parts), Some(removed)) = (self.shortened.parts(name), self.removed)
-            && let Ok(path) = relative_path(&parts[removed.min(parts.len())..].join("/"))
-        {
-            found.push(self.interpretation(&path, StepsTaken { tail: true, ..none }));
+        for (path, mut steps) in paths {
+            let Ok(path) = path else { continue };
+            let mut path = self.base.join(path);
+            if let (Some(substitute), Ok(inside)) = (&self.substitute, path.strip_prefix(IMAGES)) {
+                path = Path::new(substitute).join(inside);
+                steps.push(Step::Substitute);
+            }
+            found.push(Interpretation { path, steps });
         }
         found
-    }
-
-    fn interpretation(&self, path: &Path, taken: StepsTaken) -> Interpretation {
-        let path = self.base.join(path);
-        match (&self.substitute, path.strip_prefix(IMAGES)) {
-            (Some(substitute), Ok(inside)) => Interpretation {
-                path: Path::new(substitute).join(inside),
-                taken: StepsTaken { substitute: true, ..taken },
-                extensions: Extensions::Any,
-            },
-            _ => Interpretation { path, taken, extensions: Extensions::Similar },
-        }
     }
 
     fn matches(
@@ -308,12 +313,12 @@ impl Lookup {
         tolerance: Tolerance,
         claimed: ClaimedFiles,
     ) -> Vec<PathBuf> {
-        let Interpretation { path, extensions, .. } = interpretation;
-        let mut files = candidates(&mut self.listings, path, tolerance, *extensions);
+        let (path, any_extension) = (&interpretation.path, interpretation.has_any_extension());
+        let mut files = candidates(&mut self.listings, path, tolerance, any_extension);
         // A converted copy of an unsupported file is preferred to the file itself.
         if tolerance == Tolerance::NONE && !files.is_empty() && is_unsupported_name(path) {
             let converted = Tolerance { extension: true, ..tolerance };
-            let found = candidates(&mut self.listings, path, converted, *extensions);
+            let found = candidates(&mut self.listings, path, converted, any_extension);
             files = if found.is_empty() { files } else { found };
         }
         if tolerance != Tolerance::NONE && claimed == ClaimedFiles::Excluded {
@@ -329,8 +334,8 @@ impl Lookup {
         interpretation: &Interpretation,
         tolerance: Tolerance,
         file: &Path,
-    ) -> (LocatedFile, StepsTaken) {
-        let Interpretation { path, taken, extensions } = interpretation;
+    ) -> (LocatedFile, Vec<Step>) {
+        let path = &interpretation.path;
         let shorter = file.with_extension("");
         let is_implied = self.is_png_implied
             && !has_image_extension(path)
@@ -338,12 +343,18 @@ impl Lookup {
             && file.extension().is_some_and(|extension| extension == "png");
         let is_exact = !tolerance.form && !tolerance.case;
         let is_renamed = tolerance.extension || is_exact && file != path;
-        let extension = is_renamed && !is_implied && *extensions == Extensions::Similar;
+        let extension = is_renamed && !is_implied && !interpretation.has_any_extension();
         let is_doubled = extension && is_image_name(path) && is_image_name(&shorter);
         let label = if is_doubled { shorter } else { file.to_path_buf() };
-        let Tolerance { form, case, .. } = tolerance;
-        let taken = StepsTaken { extension, form, case, ..*taken };
-        (LocatedFile { path: file.to_path_buf(), label }, taken)
+        let mut steps = interpretation.steps.clone();
+        for (is_taken, step) in [
+            (extension, Step::Extension),
+            (tolerance.form, Step::Form),
+            (tolerance.case, Step::Case),
+        ] {
+            steps.extend(is_taken.then_some(step));
+        }
+        (LocatedFile { path: file.to_path_buf(), label }, steps)
     }
 
     /// Chooses the number of parts to remove from names and the substitute for a missing `images`,
