@@ -78,10 +78,10 @@ impl Table {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Band {
     /// First and last coefficient in zigzag order; 0 is DC.
-    first: u32,
-    last: u32,
+    pub(crate) first: u32,
+    pub(crate) last: u32,
     /// True if the scan adds a lower bit to known coefficients (successive approximation).
-    is_refinement: bool,
+    pub(crate) is_refinement: bool,
 }
 
 impl Band {
@@ -97,18 +97,6 @@ impl Band {
             last: u32::from(last),
             is_refinement: approximation >> 4 > 0,
         })
-    }
-
-    pub(crate) fn has_dc(self) -> bool {
-        self.first == 0
-    }
-
-    pub(crate) fn has_ac(self) -> bool {
-        self.last > 0
-    }
-
-    pub(crate) fn is_refinement(self) -> bool {
-        self.is_refinement
     }
 }
 

@@ -190,7 +190,7 @@ impl<'a> Walk<'a> {
         let single = if let [part] = &parts[..] { Some(part.component) } else { None };
         let grid = Grid::new(frame, single);
         let mut bits = Bits::new(self.bytes, self.offset);
-        let missing = if band.has_dc() {
+        let missing = if band.first == 0 {
             let blocks = block_tables(&parts, frame, &self.tables, band)?;
             grid.incomplete_rows(&mut bits, self.restart_interval, |bits, _| {
                 for tables in &blocks {
@@ -259,8 +259,8 @@ fn block_tables<'a>(
     for Part { component, tables: [dc, ac] } in parts {
         let [across, down] = frame.components[*component].factors;
         let count = if parts.len() == 1 { 1 } else { across * down };
-        let dc = if band.is_refinement() { None } else { Some(tables[0].get(*dc)?.as_ref()?) };
-        let ac = if band.has_ac() { Some(tables[1].get(*ac)?.as_ref()?) } else { None };
+        let dc = if band.is_refinement { None } else { Some(tables[0].get(*dc)?.as_ref()?) };
+        let ac = if band.last > 0 { Some(tables[1].get(*ac)?.as_ref()?) } else { None };
         blocks.extend((0..count).map(|_| [dc, ac]));
     }
     Some(blocks)

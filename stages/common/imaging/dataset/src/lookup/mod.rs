@@ -70,15 +70,6 @@ impl From<PathBuf> for LocatedFile {
     }
 }
 
-/// Treatment of files that other names match literally.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum ClaimedFiles {
-    /// Claimed files are not found by tolerance.
-    Excluded,
-    /// Claimed files are also found by tolerance.
-    Included,
-}
-
 /// Names that may lose leading folders.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum ShortenedNames {
@@ -202,15 +193,16 @@ impl Lookup {
 
     /// Finds the file of a name, and records the steps that led there.
     pub(crate) fn find(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
-        self.locate(name, ClaimedFiles::Excluded)
+        self.locate(name, false)
     }
 
     /// Finds the file of a name in a list that repeats names, which another name may have claimed.
     pub(crate) fn find_repeated(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
-        self.locate(name, ClaimedFiles::Included)
+        self.locate(name, true)
     }
 
-    fn locate(&mut self, name: &str, claimed: ClaimedFiles) -> Result<LocatedFile, LookupError> {
+    /// Finds the file of a name; one that another name matches literally only if `may_be_claimed`.
+    fn locate(&mut self, name: &str, may_be_claimed: bool) -> Result<LocatedFile, LookupError> {
         let literal = self.literal_path(name);
         let mut missing = None;
         if let Ok(path) = &literal {
@@ -221,7 +213,7 @@ impl Lookup {
                 Err(problem) => return Err(problem.into()),
             }
         }
-        if let Some((file, steps)) = self.search(name, claimed)? {
+        if let Some((file, steps)) = self.search(name, may_be_claimed)? {
             self.steps.record(name, &file.path, steps);
             return Ok(file);
         }
@@ -263,12 +255,12 @@ impl Lookup {
     fn search(
         &mut self,
         name: &str,
-        claimed: ClaimedFiles,
+        may_be_claimed: bool,
     ) -> Result<Option<(LocatedFile, Vec<Step>)>, LookupError> {
         let interpretations = self.interpretations(name);
         for tolerance in Tolerance::all() {
             for interpretation in &interpretations {
-                match &self.matches(interpretation, tolerance, claimed)[..] {
+                match &self.matches(interpretation, tolerance, may_be_claimed)[..] {
                     [] => {}
                     [file] => return Ok(Some(self.located(interpretation, tolerance, file))),
                     [first, second, ..] => {
@@ -311,7 +303,7 @@ impl Lookup {
         &mut self,
         interpretation: &Interpretation,
         tolerance: Tolerance,
-        claimed: ClaimedFiles,
+        may_be_claimed: bool,
     ) -> Vec<PathBuf> {
         let (path, any_extension) = (&interpretation.path, interpretation.has_any_extension());
         let mut files = candidates(&mut self.listings, path, tolerance, any_extension);
@@ -321,7 +313,7 @@ impl Lookup {
             let found = candidates(&mut self.listings, path, converted, any_extension);
             files = if found.is_empty() { files } else { found };
         }
-        if tolerance != Tolerance::NONE && claimed == ClaimedFiles::Excluded {
+        if tolerance != Tolerance::NONE && !may_be_claimed {
             files.retain(|file| !self.claimed.contains(file));
         }
         files
@@ -404,7 +396,7 @@ impl Lookup {
 
     /// True if at least one file matches a name.
     fn has_file(&mut self, name: &str) -> bool {
-        !matches!(self.search(name, ClaimedFiles::Included), Ok(None))
+        !matches!(self.search(name, true), Ok(None))
     }
 }
 
