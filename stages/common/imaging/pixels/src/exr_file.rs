@@ -59,14 +59,9 @@ impl ExrImage {
         for name in names {
             let samples = self.channel(name).unwrap_or_default();
             if let Some(index) = samples.iter().position(|sample| !sample.is_finite()) {
-                return Err(PixelError::NotFinite {
-                    path: path.to_path_buf(),
-                    channel: (*name).to_owned(),
-                    x: index % self.width,
-                    y: index / self.width,
-                    value: samples[index],
-                    remedy: "export the image again with finite samples",
-                });
+                let pixel = [index % self.width, index / self.width];
+                let remedy = "export the image again with finite samples";
+                return Err(not_finite(path, name, pixel, samples[index], remedy));
             }
         }
         Ok(self)
@@ -179,7 +174,9 @@ fn header<'a>(
     header
 }
 
-fn check_finite(
+/// Fails at the first sample, in a band of rows from `first`, that is NaN or infinite; `path` names
+/// the file that would have the samples.
+pub fn check_finite(
     path: &Path,
     channels: &[Channel],
     width: usize,
@@ -188,14 +185,22 @@ fn check_finite(
 ) -> Result<(), PixelError> {
     let Some(index) = samples.iter().position(|v| !v.is_finite()) else { return Ok(()) };
     let pixel = index / channels.len();
-    Err(PixelError::NotFinite {
-        path: path.to_path_buf(),
-        channel: channels[index % channels.len()].name.to_owned(),
-        x: pixel % width,
-        y: first + pixel / width,
-        value: samples[index],
-        remedy: "the file was not written",
-    })
+    let name = channels[index % channels.len()].name;
+    let pixel = [pixel % width, first + pixel / width];
+    Err(not_finite(path, name, pixel, samples[index], "the file was not written"))
+}
+
+fn not_finite(
+    path: &Path,
+    channel: &str,
+    [x, y]: [usize; 2],
+    value: f32,
+    remedy: &str,
+) -> PixelError {
+    PixelError::Unsupported(format!(
+        "{}: channel {channel} is {value} at column {x}, row {y}; {remedy}",
+        path.display()
+    ))
 }
 
 /// Returns the samples line by line, channel by channel (sorted by name), native-endian: the layout
@@ -501,8 +506,9 @@ mod tests {
                 samples[3 * 5 + 2] = f32::NAN;
                 Ok::<(), PixelError>(())
             });
-        assert!(matches!(result, Err(PixelError::NotFinite { x: 1, y: 1, ref channel,
-                .. }) if channel == "Z"));
+        let message = result.unwrap_err().to_string();
+        let expected = "a.exr: channel Z is NaN at column 1, row 1; the file was not written";
+        assert!(message.ends_with(expected), "{message}");
     }
 
     #[test]
