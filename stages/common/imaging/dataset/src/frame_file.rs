@@ -51,23 +51,9 @@ pub(crate) struct ReadFrames {
     pub(crate) frames: Vec<Frame>,
     pub(crate) names: FrameNames,
     /// Skipped frames whose image doesn't exist.
-    missing: CountedNames,
+    missing: Vec<String>,
     /// Depth images that aren't EXR, missing ones included.
-    unused_depths: CountedNames,
-}
-
-/// Number of files, and the name of the first.
-#[derive(Default)]
-struct CountedNames {
-    count: usize,
-    first: Option<String>,
-}
-
-impl CountedNames {
-    fn add(&mut self, name: &str) {
-        self.count += 1;
-        self.first.get_or_insert_with(|| name.to_owned());
-    }
+    unused_depths: Vec<String>,
 }
 
 /// Creates the lookup for the names in all frame files of a data set.
@@ -87,8 +73,8 @@ pub(crate) fn lookup_of(folder: &Path, files: &[&FrameFile]) -> Lookup {
 impl ReadFrames {
     /// Returns the note on skipped frames, if any.
     pub(crate) fn missing_note(&self) -> Option<String> {
-        let first = self.missing.first.as_ref()?;
-        let (count, frames) = (self.missing.count, self.frames.len() + self.missing.count);
+        let (first, count) = (self.missing.first()?, self.missing.len());
+        let frames = self.frames.len() + count;
         Some(format!(
             "{count} of {frames} frames have no image file and are skipped (first: {first})"
         ))
@@ -96,8 +82,8 @@ impl ReadFrames {
 
     /// Returns the note on unused depth images, if any.
     pub(crate) fn depth_note(&self) -> Option<String> {
-        let first = self.unused_depths.first.as_ref()?;
-        let unused = counted_with_verb(self.unused_depths.count, "depth image", ["is", "are"]);
+        let first = self.unused_depths.first()?;
+        let unused = counted_with_verb(self.unused_depths.len(), "depth image", ["is", "are"]);
         Some(format!("{unused} not used (depth_file_path, first: {first}); only EXR depth is"))
     }
 }
@@ -148,7 +134,7 @@ impl FrameFile {
             let label = || frame_label(&self.path, index, &entry.file_path);
             let file = match lookup.find(&entry.file_path) {
                 Err(error) if error.is_missing() && on_missing == MissingImages::Skipped => {
-                    read.missing.add(&entry.file_path);
+                    read.missing.push(entry.file_path.clone());
                     continue;
                 }
                 found => found.with_context(label)?,
@@ -162,8 +148,8 @@ impl FrameFile {
             read.frames.push(frame);
             labels.push(file.label);
         }
-        if let Some(first) = read.missing.first.as_ref().filter(|_| read.frames.is_empty()) {
-            bail!(images_missing(read.missing.count, None, first).context(path_text(&self.path)));
+        if let Some(first) = read.missing.first().filter(|_| read.frames.is_empty()) {
+            bail!(images_missing(read.missing.len(), None, first).context(path_text(&self.path)));
         }
         assign_names(&mut read.frames, &self.path, &labels)?;
         Ok(read)
@@ -198,14 +184,14 @@ fn find_mask(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>
 fn find_depth(
     lookup: &mut Lookup,
     entry: &FrameEntry,
-    unused: &mut CountedNames,
+    unused: &mut Vec<String>,
 ) -> Result<Option<PathBuf>, LookupError> {
     let Some(name) = &entry.depth_file_path else { return Ok(None) };
     match lookup.find(name) {
         Ok(file) if is_exr(&file.path) => Ok(Some(lookup.root().join(file.path))),
         Err(error) if is_exr(Path::new(name)) => Err(error),
         _ => {
-            unused.add(name);
+            unused.push(name.clone());
             Ok(None)
         }
     }

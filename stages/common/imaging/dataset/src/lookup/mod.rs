@@ -173,10 +173,8 @@ impl Lookup {
 
     /// Returns the folder that names are relative to.
     pub(crate) fn base(&self) -> PathBuf {
-        if self.base.as_os_str().is_empty() {
-            return self.root().to_path_buf();
-        }
-        self.root().join(&self.base)
+        // Collecting removes the slash that `join` adds before an empty path.
+        self.root().join(&self.base).components().collect()
     }
 
     /// Returns a path of the data set relative to the folder of photographs.
