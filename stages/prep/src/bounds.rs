@@ -210,13 +210,13 @@ fn contracted_bounds(boxed: Bounds, views: &[CameraDepths]) -> Bounds {
     let known = views.iter().filter_map(|(_, depths)| *depths);
     let near = known.clone().map(|d| 0.5 * d[0]).fold(0.05 * radius, f64::min);
     let far = known.map(|d| 10.0 * d[1]).fold(100.0 * radius, f64::max);
-    let (min, max) = if faces_outward {
-        let half = DVec3::splat(radius);
-        ((centre - half).to_array(), (centre + half).to_array())
-    } else {
-        (boxed.min, boxed.max)
-    };
-    Bounds { min, max, near, far, space: Space::Contraction }
+    let contracted = Bounds { near, far, space: Space::Contraction, ..boxed };
+    if !faces_outward {
+        return contracted;
+    }
+    let half = DVec3::splat(radius);
+    let (min, max) = ((centre - half).to_array(), (centre + half).to_array());
+    Bounds { min, max, ..contracted }
 }
 
 /// Number of cells along each side of the sampling grid over a fisheye image; chosen by hand.
@@ -275,14 +275,9 @@ fn box_bounds(views: &[CameraDepths]) -> Bounds {
     let widest = widths.into_iter().filter(|width| *width <= limit).fold(0.0, f64::max);
     // A twentieth more, for silhouettes that touch the image border.
     let half = if widest > 0.0 { 1.05 * widest } else { UNKNOWN_HALF_SIDE };
-    let box_only = Bounds {
-        min: (centre - DVec3::splat(half)).to_array(),
-        max: (centre + DVec3::splat(half)).to_array(),
-        near: 0.0,
-        far: 0.0,
-        space: Space::Box,
-    };
-    with_ray_range(box_only, &cameras)
+    let (min, max) = (centre - DVec3::splat(half), centre + DVec3::splat(half));
+    let (near, far) = ray_range(min, max, &cameras);
+    Bounds { min: min.to_array(), max: max.to_array(), near, far, space: Space::Box }
 }
 
 /// Half side of the box around cameras at one position, from which no depth follows; chosen by
@@ -338,9 +333,8 @@ fn frusta_bounds(views: &[CameraDepths]) -> Option<Bounds> {
     bounds.is_valid().then_some(bounds)
 }
 
-/// Sets near and far to the distances of the box's nearest and farthest point over all cameras.
-fn with_ray_range(bounds: Bounds, cameras: &[&Camera]) -> Bounds {
-    let (min, max) = (DVec3::from(bounds.min), DVec3::from(bounds.max));
+/// Returns the distances of a box's nearest and farthest point over all cameras.
+fn ray_range(min: DVec3, max: DVec3, cameras: &[&Camera]) -> (f64, f64) {
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
     for camera in cameras {
         let c = camera.centre();
@@ -348,7 +342,7 @@ fn with_ray_range(bounds: Bounds, cameras: &[&Camera]) -> Bounds {
         far = far.max((c - min).abs().max((c - max).abs()).length());
     }
     // Cameras inside the box skip a sliver, chosen by hand: no surface is on the lens.
-    Bounds { near: near.max(1e-3 * far), far, ..bounds }
+    (near.max(1e-3 * far), far)
 }
 
 #[cfg(test)]
