@@ -5,16 +5,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, anyhow, bail, ensure};
 use artifact::shortened;
-use serde::Deserialize;
-use serde::de::DeserializeOwned;
-use serde_json::{Map, Value, json};
+use serde_json::Value;
 
+use crate::entry::{Entry, quote_python_numbers};
 use crate::error::{frame_label, images_missing};
 use crate::file_status::path_text;
 use crate::frame::{Frame, assign_names};
 use crate::lookup::{Lookup, LookupError};
 use crate::masks::{MaskFile, MaskKind};
-use crate::number::quote_python_numbers;
 use crate::photograph::is_exr;
 use crate::split::{FrameNames, SplitLists};
 use crate::text::{counted_with_verb, read_text};
@@ -35,14 +33,6 @@ pub(crate) struct FrameFile {
     frames: Vec<FrameEntry>,
     /// nerfstudio's own split.
     pub(crate) split_lists: SplitLists,
-}
-
-/// Content of a file; frames are parsed one by one.
-#[derive(Deserialize)]
-struct Listed {
-    frames: Vec<Value>,
-    #[serde(flatten)]
-    split_lists: SplitLists,
 }
 
 /// Frames of a file, and names of files that can't be read.
@@ -93,18 +83,14 @@ impl FrameFile {
     pub(crate) fn read(path: &Path) -> anyhow::Result<Self> {
         let text = read_text(path)?;
         ensure!(!text.trim().is_empty(), "{}: file is empty", path_text(path));
-        let value = parse(&text)
-            .map_err(|error| anyhow!(json_message(&error)))
-            .with_context(|| path_text(path))?;
-        let Listed { frames: values, split_lists } =
-            from_object(&value, &json!({"frames": []})).with_context(|| path_text(path))?;
-        let mut shared = value.as_object().cloned().unwrap_or_default();
-        // Lists of files and the frames themselves are no values of a frame.
-        shared.retain(|_, value| !value.is_array());
-        let required = json!({"file_path": "", "transform_matrix": []});
+        let value = parse(&text).map_err(|error| anyhow!(json_message(&error)));
+        let mut file =
+            value.and_then(|value| Entry::new(&value)).with_context(|| path_text(path))?;
+        let values = file.take("frames").with_context(|| path_text(path))?;
+        let split_lists = SplitLists::read(&file).with_context(|| path_text(path))?;
         let mut frames = Vec::with_capacity(values.len());
         for (index, value) in values.iter().enumerate() {
-            let frame = from_object(&with_shared_values(value, &shared), &required);
+            let frame = Entry::new(value).and_then(|own| FrameEntry::new(own.or(&file)));
             frames.push(frame.with_context(|| {
                 let name = value.get("file_path").and_then(Value::as_str).unwrap_or("unnamed");
                 frame_label(path, index, name)
@@ -156,22 +142,6 @@ impl FrameFile {
     }
 }
 
-/// Returns a frame's object with the file's shared values for keys that the frame lacks. A frame's
-/// angle of view takes the place of a shared focal length.
-fn with_shared_values(frame: &Value, shared: &Map<String, Value>) -> Value {
-    let Some(own) = frame.as_object() else { return frame.clone() };
-    let mut merged = shared.clone();
-    for (angle, length) in [("camera_angle_x", "fl_x"), ("camera_angle_y", "fl_y")] {
-        if own.get(angle).is_some_and(|angle| !angle.is_null()) {
-            merged.remove(length);
-        }
-    }
-    for (key, value) in own.iter().filter(|(_, value)| !value.is_null()) {
-        merged.insert(key.clone(), value.clone());
-    }
-    Value::Object(merged)
-}
-
 /// Finds the mask that a frame names, if any.
 fn find_mask(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>, LookupError> {
     let Some(name) = &entry.mask_path else { return Ok(None) };
@@ -204,22 +174,6 @@ fn json_message(error: &serde_json::Error) -> String {
         Cow::Borrowed(_) => text,
         Cow::Owned(cut) => format!("{cut} at line {} column {}", error.line(), error.column()),
     }
-}
-
-/// Converts a JSON object; an error names the key. `required` is an object with the required keys
-/// alone: flattened structures lose the position of an error.
-fn from_object<T: DeserializeOwned>(value: &Value, required: &Value) -> anyhow::Result<T> {
-    let reason = |error: serde_json::Error| anyhow!("{}", shortened(&error.to_string()));
-    T::deserialize(value).map_err(|error| {
-        for (key, value) in value.as_object().into_iter().flatten() {
-            let mut single = required.clone();
-            single[key] = value.clone();
-            if let Err(error) = T::deserialize(&single) {
-                return reason(error).context(shortened(key).into_owned());
-            }
-        }
-        reason(error)
-    })
 }
 
 /// Parses the JSON. Python's `NaN` and `Infinity` are accepted as numbers, so that the later error

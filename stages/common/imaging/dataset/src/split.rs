@@ -1,10 +1,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use anyhow::ensure;
+use anyhow::{Context as _, ensure};
 use artifact::{format_count, relative_path};
-use serde::Deserialize;
 
+use crate::entry::Entry;
 use crate::lookup::{Lookup, LookupError};
 
 /// Interval of held-out frames, as in LLFF's code.
@@ -35,12 +35,7 @@ impl Split {
 }
 
 /// nerfstudio's lists of file names. An empty list counts as absent.
-#[derive(Deserialize)]
-pub(crate) struct SplitLists {
-    train_filenames: Option<Vec<String>>,
-    test_filenames: Option<Vec<String>>,
-    val_filenames: Option<Vec<String>>,
-}
+pub(crate) struct SplitLists([(&'static str, Vec<String>); 3]);
 
 /// Frames by the names and files that split lists may contain.
 #[derive(Debug, Default)]
@@ -72,19 +67,22 @@ impl FrameNames {
 }
 
 impl SplitLists {
-    /// Returns the key and the names of each list.
-    fn lists(&self) -> [(&'static str, &[String]); 3] {
-        [
-            ("train_filenames", &self.train_filenames),
-            ("test_filenames", &self.test_filenames),
-            ("val_filenames", &self.val_filenames),
-        ]
-        .map(|(key, names)| (key, names.as_deref().unwrap_or_default()))
+    /// Reads the lists of training, test and validation views.
+    pub(crate) fn read(entry: &Entry) -> anyhow::Result<Self> {
+        let mut lists =
+            ["train_filenames", "test_filenames", "val_filenames"].map(|key| (key, Vec::new()));
+        for (key, names) in &mut lists {
+            for name in entry.list(key)? {
+                let name = name.as_str().with_context(|| format!("{key}: {name} is not text"))?;
+                names.push(name.to_owned());
+            }
+        }
+        Ok(Self(lists))
     }
 
     /// Returns the names in all lists.
     pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
-        self.lists().into_iter().flat_map(|(_, names)| names).map(String::as_str)
+        self.0.iter().flat_map(|(_, names)| names).map(String::as_str)
     }
 
     /// Returns the split of `count` frames that the lists describe, with notes. Validation views
@@ -98,7 +96,7 @@ impl SplitLists {
     ) -> anyhow::Result<(Option<Split>, Vec<String>)> {
         let mut notes = Vec::new();
         let [train, test, val] =
-            self.lists().map(|list| listed_frames(list, names, lookup, &mut notes));
+            self.0.each_ref().map(|list| listed_frames(list, names, lookup, &mut notes));
         let (train, test, val) = (train?, test?, val?);
         let listed: BTreeSet<usize> = train.iter().chain(&test).chain(&val).copied().collect();
         let unlisted: BTreeSet<usize> = (0..count).filter(|i| !listed.contains(i)).collect();
@@ -130,7 +128,7 @@ impl SplitLists {
 /// Returns the frames of a list. Names without a frame are noted; a list of only such names is an
 /// error.
 fn listed_frames(
-    (list, list_names): (&str, &[String]),
+    (list, list_names): &(&str, Vec<String>),
     names: &FrameNames,
     lookup: &mut Lookup,
     notes: &mut Vec<String>,

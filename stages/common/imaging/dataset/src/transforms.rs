@@ -3,28 +3,35 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail, ensure};
 use artifact::{format_count, format_number};
 use scene::{CameraError, Intrinsics};
-use serde::Deserialize;
 use serde_json::Value;
 
 use crate::dataset::Dataset;
+use crate::entry::{Entry, parse_number};
 use crate::file_status::path_text;
 use crate::format::Format;
 use crate::frame::{Frame, Turn};
 use crate::frame_file::{FrameFile, MissingImages, lookup_of};
-use crate::lens_entry::LensEntry;
-use crate::number::Number;
+use crate::lens_entry::distortion;
 use crate::photograph::{ImageHeader, fit_camera, read_header};
 
 /// Frame of `transforms.json`, with the file's shared values.
-#[derive(Deserialize)]
 pub(crate) struct FrameEntry {
     pub(crate) file_path: String,
     pub(crate) mask_path: Option<String>,
     pub(crate) depth_file_path: Option<String>,
-    /// Pose, row by row.
-    transform_matrix: Value,
-    #[serde(flatten)]
-    lens: LensEntry,
+    /// All values, of the pose and the lens, too.
+    values: Entry,
+}
+
+impl FrameEntry {
+    /// Reads the names of a frame's files.
+    pub(crate) fn new(values: Entry) -> anyhow::Result<Self> {
+        let [image, mask, depth] = ["file_path", "mask_path", "depth_file_path"]
+            .map(|key| values.text(key).map(|name| name.map(str::to_owned)));
+        let file_path = image?.context("missing field `file_path`")?;
+        ensure!(values.has("transform_matrix"), "missing field `transform_matrix`");
+        Ok(Self { file_path, mask_path: mask?, depth_file_path: depth?, values })
+    }
 }
 
 /// Reads `transforms.json`, the format of instant-ngp and nerfstudio.
@@ -52,13 +59,13 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Dataset> {
 
 /// Reads a frame without its name, mask and depth.
 pub(crate) fn read_frame(image: PathBuf, entry: &FrameEntry) -> anyhow::Result<Frame> {
-    let rows = matrix_rows(&entry.transform_matrix);
+    let rows = entry.values.value("transform_matrix").and_then(matrix_rows);
     let (camera_to_world, last) = match rows.as_deref() {
         Some([x, y, z]) => ([*x, *y, *z], None),
         Some([x, y, z, last]) => ([*x, *y, *z], Some(*last)),
         _ => bail!("transform_matrix must have 4 rows of 4 numbers"),
     };
-    let fitted = intrinsics(&entry.lens, read_header(&image)?)?;
+    let fitted = intrinsics(&entry.values, read_header(&image)?)?;
     let frame = Frame::new(image, fitted, camera_to_world);
     match frame.check() {
         Err(CameraError::Pose(problem)) => bail!("transform_matrix: {problem}"),
@@ -80,8 +87,7 @@ fn matrix_rows(matrix: &Value) -> Option<Vec<[f64; 4]>> {
             return None;
         }
         for value in values {
-            let number = Option::<Number>::deserialize(value).ok()?;
-            numbers.push(number.map_or(f64::NAN, |number| number.0));
+            numbers.push(if value.is_null() { f64::NAN } else { parse_number(value)? });
         }
     }
     let (rows, rest) = numbers.as_chunks::<4>();
@@ -103,21 +109,21 @@ fn check_last_row(row: [f64; 4]) -> anyhow::Result<()> {
 }
 
 /// Returns an image's intrinsics and the treatment of its EXIF orientation.
-fn intrinsics(entry: &LensEntry, stored: ImageHeader) -> anyhow::Result<(Intrinsics, Turn)> {
-    let distortion = entry.distortion()?;
+fn intrinsics(entry: &Entry, stored: ImageHeader) -> anyhow::Result<(Intrinsics, Turn)> {
+    let distortion = distortion(entry)?;
     // The size to which the intrinsics refer; the stored image may be a smaller copy.
-    let width = entry.w.map_or(Ok(stored.size.0), |w| side_length(w.0, "w"))?;
-    let height = entry.h.map_or(Ok(stored.size.1), |h| side_length(h.0, "h"))?;
-    let fx = focal_length(entry.fl_x, entry.camera_angle_x, "camera_angle_x", width)?;
-    let fy = focal_length(entry.fl_y, entry.camera_angle_y, "camera_angle_y", height)?;
+    let width = entry.number("w")?.map_or(Ok(stored.size.0), |w| side_length(w, "w"))?;
+    let height = entry.number("h")?.map_or(Ok(stored.size.1), |h| side_length(h, "h"))?;
+    let fx = focal_length(entry, "fl_x", "camera_angle_x", width)?;
+    let fy = focal_length(entry, "fl_y", "camera_angle_y", height)?;
     let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
         bail!("no focal length: neither fl_x nor camera_angle_x is given");
     };
-    let cx = entry.cx.map_or(0.5 * f64::from(width), |cx| cx.0);
-    let cy = entry.cy.map_or(0.5 * f64::from(height), |cy| cy.0);
+    let cx = entry.number("cx")?.unwrap_or(0.5 * f64::from(width));
+    let cy = entry.number("cy")?.unwrap_or(0.5 * f64::from(height));
     let (k, turn) = fit_camera(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)?;
     // Without w and h the camera has the stored shape by assumption, which settles no turn.
-    let is_assumed = turn == Turn::Stored && (entry.w.is_none() || entry.h.is_none());
+    let is_assumed = turn == Turn::Stored && !(entry.has("w") && entry.has("h"));
     Ok((k, if is_assumed { stored.turn_if_both_fit() } else { turn }))
 }
 
@@ -134,22 +140,21 @@ pub(crate) fn side_length(value: f64, name: &str) -> anyhow::Result<u32> {
 
 /// Returns the focal length in pixels, given directly or by the angle of view across `size` pixels.
 fn focal_length(
-    length: Option<Number>,
-    angle: Option<Number>,
-    name: &str,
+    entry: &Entry,
+    length: &str,
+    angle: &str,
     size: u32,
 ) -> anyhow::Result<Option<f64>> {
-    match (length, angle) {
-        (Some(Number(length)), _) => Ok(Some(length)),
-        (None, Some(Number(angle))) if angle > 0.0 && angle < std::f64::consts::PI => {
-            Ok(Some(0.5 * f64::from(size) / (0.5 * angle).tan()))
-        }
-        (None, Some(Number(angle))) => {
-            let angle = format_number(angle);
-            bail!("{name} is {angle}; the angle must be between 0 and π (is it in degrees?)")
-        }
-        (None, None) => Ok(None),
+    if let Some(length) = entry.number(length)? {
+        return Ok(Some(length));
     }
+    let Some(value) = entry.number(angle)? else { return Ok(None) };
+    ensure!(
+        value > 0.0 && value < std::f64::consts::PI,
+        "{angle} is {}; the angle must be between 0 and π (is it in degrees?)",
+        format_number(value)
+    );
+    Ok(Some(0.5 * f64::from(size) / (0.5 * value).tan()))
 }
 
 #[cfg(test)]
@@ -332,6 +337,7 @@ mod tests {
             (r#""camera_angle_x": -1"#, "", "between 0 and π"),
             (r#""fl_x": 50"#, r#""k1": [1],"#, "k1: expected a number, found [1]"),
             (r#""fl_x": 50"#, r#""mask_path": 7,"#, "mask_path: expected text, found 7"),
+            (r#""fl_x": "wide""#, "", "fl_x: expected a number, found \"wide\""),
         ] {
             let message = read(&frames(head, first)).unwrap_err().to_string();
             assert!(
@@ -359,7 +365,7 @@ mod tests {
         }
         for (json, expected) in [
             ("", "transforms.json: file is empty"),
-            ("[]", "transforms.json: expected a mapping, found a list"),
+            ("[]", "transforms.json: expected a mapping, found []"),
             (
                 r#"{"frames": [{"file_path": "a.png"}]}"#,
                 "frame 0 (a.png): missing field `transform_matrix`",
@@ -369,10 +375,6 @@ mod tests {
                 "frame 0 (unnamed): missing field `file_path`",
             ),
             (r#"{"frames": [1]}"#, "frame 0 (unnamed): expected a mapping, found 1"),
-            (
-                r#"{"fl_x": "wide", "frames": [{"file_path": "a", "transform_matrix": []}]}"#,
-                "frame 0 (a): fl_x: expected a number, found \"wide\"",
-            ),
         ] {
             let message = read(json).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");
