@@ -6,10 +6,9 @@
 //! pixel is missing. A progressive JPEG needs its end marker, since nothing else determines the
 //! number of scans.
 //!
-//! An invalid segment before the first scan is left to the decoder, which reports it; if it
-//! doesn't, the file is refused. The decoder ignores an invalid scan header, and any invalid
-//! segment after the first scan. Here either ends the image data: a sequential JPEG whose rows are
-//! complete by then is accepted.
+//! A file with an invalid segment before the first scan is refused. The decoder ignores an invalid
+//! scan header, and any invalid segment after the first scan. Here either ends the image data: a
+//! sequential JPEG whose rows are complete by then is accepted.
 
 use std::ops::{Range, RangeInclusive};
 
@@ -45,8 +44,7 @@ fn is_known_marker(marker: u8) -> bool {
 pub(crate) enum Completeness {
     /// Complete data.
     Complete,
-    /// Invalid segment before the first scan, or no frame header: the decoder should refuse the
-    /// file.
+    /// Invalid segment before the first scan, or no frame header.
     UnreadableHeader,
     /// Complete rows without an end marker that the decoder reaches. The image data end at offset
     /// `end`.

@@ -20,13 +20,16 @@ pub(crate) const IMAGE_EXTENSIONS: [&str; 4] = [".png", ".jpg", ".jpeg", ".exr"]
 
 /// True if a file's name is that of a supported image.
 pub fn is_image_name(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| {
-        IMAGE_EXTENSIONS.iter().any(|known| extension.eq_ignore_ascii_case(&known[1..]))
-    })
+    IMAGE_EXTENSIONS.iter().any(|known| has_extension(path, &known[1..]))
 }
 
 pub(crate) fn is_exr(path: &Path) -> bool {
-    path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
+    has_extension(path, "exr")
+}
+
+/// True if a file's name has an extension, in any case.
+pub(crate) fn has_extension(path: &Path, extension: &str) -> bool {
+    path.extension().is_some_and(|found| found.eq_ignore_ascii_case(extension))
 }
 
 /// Creates the decoder of a PNG or JPEG, recognised by content rather than by name.
@@ -140,35 +143,31 @@ fn read_image(path: &Path, turn_upright: bool) -> Result<(Rgba8, Clipping), Pixe
         return read_exr_photograph(path);
     }
     let mut bytes = fs::read(path).map_err(PixelError::io(path))?;
-    let mut is_header_readable = true;
     if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
-        is_header_readable =
-            complete_jpeg(&mut bytes).map_err(|reason| PixelError::format(path, reason))?;
+        complete_jpeg(&mut bytes).map_err(|reason| PixelError::format(path, reason))?;
     }
     let mut decoder = decoder(Cursor::new(bytes), path)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
         .map_err(|e| PixelError::format(path, format!("incomplete or damaged image ({e})")))?;
-    if !is_header_readable {
-        return Err(PixelError::format(path, "damaged JPEG: headers and image data don't match"));
-    }
     if turn_upright {
         image.apply_orientation(orientation);
     }
     Ok((image.into(), Clipping::default()))
 }
 
-/// Fails if rows or scans of a JPEG are missing, which its decoder would replace by grey. Adds a
-/// missing end marker, without which the decoder omits the last rows. Returns false if the headers
-/// are unreadable.
-fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<bool, String> {
+/// Fails if headers of a JPEG are unreadable, or rows or scans are missing, which its decoder would
+/// replace by grey. Adds a missing end marker, without which the decoder omits the last rows.
+fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<(), String> {
     match check_completeness(jpeg) {
-        Completeness::Complete => Ok(true),
-        Completeness::UnreadableHeader => Ok(false),
+        Completeness::Complete => Ok(()),
+        Completeness::UnreadableHeader => {
+            Err("damaged JPEG: headers and image data don't match".to_owned())
+        }
         Completeness::Unterminated { end } => {
             jpeg.truncate(end);
             jpeg.extend(END_MARKER);
-            Ok(true)
+            Ok(())
         }
         Completeness::Missing { rows, height } => {
             Err(format!("cut short or damaged: {rows} of {height} rows are missing"))

@@ -219,7 +219,7 @@ fn mistakes_are_named() {
         ("80 60 70 40", "0 60 70 40", "image size 0×60 is invalid"),
         ("80 60 70 40", "80 80 70 40", "aspect ratios must match"),
         ("70 40 30 -0.1", "nan 40 30 -0.1", "fx is NaN"),
-        ("30 -0.1", "30 inf", "lens distortion (k1 inf,"),
+        ("30 -0.1", "30 inf", "lens distortion (k1 inf)"),
         ("70 40 30", "70 x 30", "line 2: parameter: \"x\""),
     ] {
         let message = read_texts(&CAMERAS.replace(from, to), IMAGES).unwrap_err().to_string();

@@ -358,9 +358,6 @@ impl Lookup {
             None => vec![None],
         };
         let substitutes = self.substitutes();
-        if longest.is_none() && substitutes.len() == 1 {
-            return names.iter().any(|name| self.has_file(name));
-        }
         let mut best = (0, None, None);
         for removed in &removals {
             for substitute in &substitutes {
