@@ -127,8 +127,14 @@ pub(super) fn absolute_parts(text: &str) -> Option<Vec<&str>> {
     (is_absolute && !parts.is_empty()).then_some(parts)
 }
 
+/// Splits a path without `..`; `None` for others.
+pub(super) fn inside_parts(text: &str) -> Option<Vec<&str>> {
+    let parts = parts(text);
+    (!parts.is_empty() && !parts.contains(&"..")).then_some(parts)
+}
+
 /// Splits a path into folders and file name, with either kind of slash.
-pub(super) fn parts(text: &str) -> Vec<&str> {
+fn parts(text: &str) -> Vec<&str> {
     text.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".").collect()
 }
 

@@ -22,7 +22,7 @@ use crate::photograph::is_image_name;
 use crate::unsupported::is_unsupported_name;
 
 pub(crate) use listings::Listings;
-use matching::{Tolerance, absolute_parts, candidates, parts};
+use matching::{Tolerance, absolute_parts, candidates, inside_parts};
 use steps::{Step, Steps};
 
 /// Folder of photographs in most formats; reduced copies are in `images_2`, `images_4` and so on.
@@ -70,25 +70,8 @@ impl From<PathBuf> for LocatedFile {
     }
 }
 
-/// Names that may lose leading folders.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum ShortenedNames {
-    Absolute,
-    All,
-}
-
-impl ShortenedNames {
-    /// Returns the parts of a name that may lose the first ones.
-    fn parts(self, name: &str) -> Option<Vec<&str>> {
-        match self {
-            Self::Absolute => absolute_parts(name),
-            Self::All => {
-                let parts = parts(name);
-                (!parts.is_empty() && !parts.contains(&"..")).then_some(parts)
-            }
-        }
-    }
-}
+/// Function that splits names that may lose leading folders; `None` for other names.
+type SplitName = fn(&str) -> Option<Vec<&str>>;
 
 /// Interpretation of a name as a path.
 struct Interpretation {
@@ -109,8 +92,8 @@ pub(crate) struct Lookup {
     listings: Listings,
     /// Folder that names are relative to, inside the data set's folder.
     base: PathBuf,
-    /// Names that lose leading parts.
-    shortened: ShortenedNames,
+    /// Function that splits the names that lose leading parts.
+    split_name: SplitName,
     /// Number of leading parts that such names lose; `None` if no tail is a file.
     removed: Option<usize>,
     /// Folder `images_N` that is read instead of a missing `images`.
@@ -129,8 +112,8 @@ impl Lookup {
         let mut lookup = Self::new(folder, PathBuf::new(), names);
         lookup.is_png_implied = true;
         let names = [names, repeated].concat();
-        if !lookup.choose_removed_and_substitute(&names, ShortenedNames::Absolute) {
-            lookup.choose_removed_and_substitute(&names, ShortenedNames::All);
+        if !lookup.choose_removed_and_substitute(&names, absolute_parts) {
+            lookup.choose_removed_and_substitute(&names, inside_parts);
         }
         lookup
     }
@@ -140,11 +123,11 @@ impl Lookup {
     pub(crate) fn in_images(folder: &Path, names: &[&str]) -> Self {
         let mut inside = Self::new(folder, PathBuf::from(IMAGES), names);
         let mut outside = Self::new(folder, PathBuf::new(), names);
-        for shortened in [ShortenedNames::Absolute, ShortenedNames::All] {
-            if inside.choose_removed_and_substitute(names, shortened) {
+        for split_name in [absolute_parts as SplitName, inside_parts] {
+            if inside.choose_removed_and_substitute(names, split_name) {
                 return inside;
             }
-            if outside.choose_removed_and_substitute(names, shortened) {
+            if outside.choose_removed_and_substitute(names, split_name) {
                 return outside;
             }
         }
@@ -157,7 +140,7 @@ impl Lookup {
         Self {
             listings: Listings::new(folder),
             base,
-            shortened: ShortenedNames::Absolute,
+            split_name: absolute_parts,
             removed: None,
             substitute: None,
             is_png_implied: false,
@@ -280,7 +263,7 @@ impl Lookup {
         if name.contains('\\') {
             paths.push((relative_path(&name.replace('\\', "/")), vec![Step::Slashes]));
         }
-        if let (Some(parts), Some(removed)) = (self.shortened.parts(name), self.removed) {
+        if let (Some(parts), Some(removed)) = ((self.split_name)(name), self.removed) {
             let tail = parts[removed.min(parts.len())..].join("/");
             paths.push((relative_path(&tail), vec![Step::Tail]));
         }
@@ -350,9 +333,9 @@ impl Lookup {
     /// Chooses the number of parts to remove from names and the substitute for a missing `images`,
     /// so that most names are found. Longer tails and larger copies are preferred. Returns whether
     /// at least one name is found.
-    fn choose_removed_and_substitute(&mut self, names: &[&str], shortened: ShortenedNames) -> bool {
-        self.shortened = shortened;
-        let longest = names.iter().filter_map(|name| shortened.parts(name)).map(|p| p.len()).max();
+    fn choose_removed_and_substitute(&mut self, names: &[&str], split_name: SplitName) -> bool {
+        self.split_name = split_name;
+        let longest = names.iter().filter_map(|name| split_name(name)).map(|p| p.len()).max();
         let removals: Vec<Option<usize>> = match longest {
             Some(parts) => (0..parts).map(Some).collect(),
             None => vec![None],
