@@ -103,7 +103,7 @@ fn unusable_datasets_are_refused() {
         |_, d| edit(&d.join("transforms_test.json"), "0.6911112", "3.2"),
         &[],
         3,
-        &["camera_angle_x is 3.2", "focal length"],
+        &["camera_angle_x is 3.2", "must be between 0 and π"],
     );
     assert_refused(
         |_, d| {

@@ -143,7 +143,7 @@ const DAMAGES: &[Damage] = &[
     ),
     (
         |data| edit_training(data, |list| list["frames"][1]["fl_x"] = json!("y".repeat(5_000_000))),
-        &["transforms_train.json: frame 1 (./train/r_1): fl_x: invalid type: string \"yyy", "y…"],
+        &["transforms_train.json: frame 1 (./train/r_1): fl_x: expected a number, found \"yyy", "y…"],
     ),
     (
         |data| {
@@ -162,7 +162,7 @@ const DAMAGES: &[Damage] = &[
         },
         &[
             "frame 2 (train/._r_2.png)",
-            "._r_2.png is named like editor and system files, which are ignored; rename the file",
+            "._r_2.png is named like editor and system files, which are ignored; restore or rename the file",
         ],
     ),
 ];

@@ -68,16 +68,6 @@ struct PathFrame {
     aspect: f64,
 }
 
-/// Key of a path, as nerfstudio's viewer reads it.
-#[derive(Serialize)]
-struct Key {
-    matrix: [f64; 16],
-    fov: f64,
-    aspect: f64,
-    override_transition_enabled: bool,
-    override_transition_sec: Option<f64>,
-}
-
 fn perspective() -> String {
     "perspective".to_owned()
 }
@@ -113,21 +103,19 @@ impl PathFile {
     pub(crate) fn new(camera: &Intrinsics, poses: &[Pose], is_cycle: bool) -> Self {
         let height = f64::from(camera.height);
         let fov = 2.0 * (0.5 * height / camera.fx.max(camera.fy)).atan().to_degrees();
-        let camera_path = poses.iter().map(|pose| PathFrame {
-            camera_to_world: matrix_of(pose),
-            fov,
-            aspect: f64::from(camera.width) / height,
-        });
+        let aspect = f64::from(camera.width) / height;
+        let frame = |pose| PathFrame { camera_to_world: matrix_of(pose), fov, aspect };
+        let camera_path: Vec<PathFrame> = poses.iter().map(frame).collect();
+        // As nerfstudio's viewer reads it.
         let key = |frame: &PathFrame| {
-            serde_json::json!(Key {
-                matrix: frame.camera_to_world,
-                fov,
-                aspect: frame.aspect,
-                override_transition_enabled: false,
-                override_transition_sec: None,
+            serde_json::json!({
+                "matrix": frame.camera_to_world,
+                "fov": fov,
+                "aspect": frame.aspect,
+                "override_transition_enabled": false,
+                "override_transition_sec": null,
             })
         };
-        let camera_path: Vec<PathFrame> = camera_path.collect();
         Self {
             camera_type: perspective(),
             render_width: camera.width,

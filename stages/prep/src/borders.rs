@@ -7,7 +7,7 @@ use pixels::Rgba8;
 use scene::Background;
 
 use crate::inspection::ViewBorder;
-use crate::strips::{Strips, are_similar, colour, medians};
+use crate::strips::{Strips, are_similar, colour, count_similar, medians};
 
 /// Maximum deviation of a flat colour in 8-bit levels: JPEG noise on a uniform area. A clear sky
 /// varies more from corner to corner (docs/design/035).
@@ -51,7 +51,7 @@ impl Border {
         let columns = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
         let border: Vec<[u8; 3]> = rows.chain(columns).map(|(x, y)| colour(image, x, y)).collect();
         let median = medians(&border);
-        let similar = border.iter().filter(|colour| is_similar(**colour, median)).count();
+        let similar = count_similar(&border, median, MAX_BORDER_NOISE);
         let percent = 100 * similar / border.len().max(1);
         if percent >= MIN_COLOUR_PERCENT { Self::Colour { median, percent } } else { Self::Mixed }
     }
@@ -162,26 +162,22 @@ impl Borders {
 /// Formats the evidence for the log.
 impl Display for Borders {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let flat = self.flat;
-        let views = format_count(self.views, "sampled view");
-        match self.evidence {
-            BorderEvidence::Alpha => write!(f, "images have alpha"),
-            BorderEvidence::Flat([r, g, b]) => write!(
-                f,
-                "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of \
-                {views}"
-            ),
-            BorderEvidence::Scene => {
-                write!(
-                    f,
-                    "images have no alpha; borders are one flat colour in {flat} of {views}: \
-                    too few for a plain background, so background is opaque"
-                )?;
-                let Some(suggested) = self.suggested else { return Ok(()) };
-                let name = if suggested == Background::White { "white" } else { "black" };
-                write!(f, "; if only {name} is behind the object, give -p background={name}")
-            }
+        let colour = match self.evidence {
+            BorderEvidence::Alpha => return f.write_str("images have alpha"),
+            BorderEvidence::Flat([r, g, b]) => format!(" ({r} {g} {b})"),
+            BorderEvidence::Scene => String::new(),
+        };
+        let (flat, views) = (self.flat, format_count(self.views, "sampled view"));
+        write!(
+            f,
+            "images have no alpha; borders are one flat colour{colour} in {flat} of {views}"
+        )?;
+        if self.evidence == BorderEvidence::Scene {
+            f.write_str(": too few for a plain background, so background is opaque")?;
         }
+        let Some(suggested) = self.suggested else { return Ok(()) };
+        let name = if suggested == Background::White { "white" } else { "black" };
+        write!(f, "; if only {name} is behind the object, give -p background={name}")
     }
 }
 

@@ -22,25 +22,14 @@ pub enum SpaceKind {
     Contraction,
 }
 
-/// Error returned when a requested space doesn't suit the cameras.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum SpaceError {
-    #[error(
-        "parameter space: ndc requires the depth range of each view, which the data set lacks; \
-        give near and far, or choose box"
-    )]
-    NoDepths,
-    #[error(
-        "parameter space: ndc cannot contain the view of a fisheye lens; choose box or \
-        contraction, or lens: undo"
-    )]
-    Fisheye,
-    /// Cameras whose directions differ too much for a common frustum.
-    #[error(
-        "parameter space: ndc requires cameras that face one direction; choose box or contraction"
-    )]
-    NotForward,
-}
+// Reasons why a requested space doesn't suit the cameras.
+const NO_DEPTHS: &str = "parameter space: ndc requires the depth range of each view, which the data \
+    set lacks; give near and far, or choose box";
+const IS_FISHEYE: &str = "parameter space: ndc cannot contain the view of a fisheye lens; choose box \
+    or contraction, or lens: undo";
+/// Reason for cameras whose directions differ too much for a common frustum.
+const NOT_FORWARD: &str =
+    "parameter space: ndc requires cameras that face one direction; choose box or contraction";
 
 /// Minimum distance of points from the box's centre, relative to half the box's side, above which
 /// the space becomes the contraction (design note 004).
@@ -65,7 +54,7 @@ pub(crate) fn scene_bounds(
     others: &[CameraDepths],
     is_unbounded: bool,
     kind: Option<SpaceKind>,
-) -> Result<Bounds, SpaceError> {
+) -> Result<Bounds, &'static str> {
     let origin = near_point(training);
     if origin == DVec3::ZERO {
         return bounds_near_origin(training, others, is_unbounded, kind);
@@ -106,7 +95,7 @@ fn bounds_near_origin(
     others: &[CameraDepths],
     is_unbounded: bool,
     kind: Option<SpaceKind>,
-) -> Result<Bounds, SpaceError> {
+) -> Result<Bounds, &'static str> {
     let boxed = box_bounds(training);
     let has_unknown_extent = is_unbounded && training.iter().any(|(_, depths)| depths.is_none());
     let guessed = if has_unknown_extent { guess_depths(training) } else { None };
@@ -128,16 +117,16 @@ fn ndc_bounds(
     training: &[CameraDepths],
     others: &[CameraDepths],
     guessed: Option<[f64; 2]>,
-) -> Result<Bounds, SpaceError> {
+) -> Result<Bounds, &'static str> {
     let mut all: Vec<CameraDepths> = Vec::with_capacity(training.len() + others.len());
     for (camera, depths) in training.iter().chain(others) {
         if camera.intrinsics.distortion.is_fisheye() {
-            return Err(SpaceError::Fisheye);
+            return Err(IS_FISHEYE);
         }
         all.push((camera.clone(), depths.or(guessed)));
     }
     let space = Space::Ndc(frustum(&all)?);
-    Ok(Bounds { space, ..frusta_bounds(&all).ok_or(SpaceError::NotForward)? })
+    Ok(Bounds { space, ..frusta_bounds(&all).ok_or(NOT_FORWARD)? })
 }
 
 /// Guessed nearest and farthest depth, relative to the distance of the cameras' focus
@@ -161,10 +150,10 @@ fn guess_depths(views: &[CameraDepths]) -> Option<[f64; 2]> {
 }
 
 /// Returns the NDC frustum that contains all views, from their mean centre.
-fn frustum(views: &[CameraDepths]) -> Result<Frustum, SpaceError> {
-    let forward = common_direction(views.iter().map(|(c, _)| c)).ok_or(SpaceError::NotForward)?;
+fn frustum(views: &[CameraDepths]) -> Result<Frustum, &'static str> {
+    let forward = common_direction(views.iter().map(|(c, _)| c)).ok_or(NOT_FORWARD)?;
     let up = mean(views, |c| c.rotation().y_axis);
-    let right = forward.cross(up).try_normalize().ok_or(SpaceError::NotForward)?;
+    let right = forward.cross(up).try_normalize().ok_or(NOT_FORWARD)?;
     let (up, centre) = (right.cross(forward), mean(views, Camera::centre));
     let mut frustum = Frustum {
         camera_to_world: pose_of(DMat3::from_cols(right, up, -forward), centre),
@@ -174,13 +163,13 @@ fn frustum(views: &[CameraDepths]) -> Result<Frustum, SpaceError> {
         far: 0.0,
     };
     for (camera, depths) in views {
-        let [nearest, farthest] = depths.ok_or(SpaceError::NoDepths)?;
+        let [nearest, farthest] = depths.ok_or(NO_DEPTHS)?;
         // Known depths are those of matched points, but surfaces may be nearer or much farther. The
         // factors are chosen by hand.
         for corner in extreme_points(camera, [0.9 * nearest, 2.0 * farthest]) {
             let p = frustum.to_camera(corner);
             if p.z <= 0.0 {
-                return Err(SpaceError::NotForward);
+                return Err(NOT_FORWARD);
             }
             for (i, slope) in [p.x / p.z, p.y / p.z].into_iter().enumerate() {
                 frustum.min[i] = frustum.min[i].min(slope);
@@ -190,7 +179,7 @@ fn frustum(views: &[CameraDepths]) -> Result<Frustum, SpaceError> {
             frustum.far = frustum.far.max(p.z);
         }
     }
-    if frustum.is_valid() { Ok(frustum) } else { Err(SpaceError::NotForward) }
+    if frustum.is_valid() { Ok(frustum) } else { Err(NOT_FORWARD) }
 }
 
 fn mean(views: &[CameraDepths], vector: fn(&Camera) -> DVec3) -> DVec3 {
@@ -221,13 +210,13 @@ fn contracted_bounds(boxed: Bounds, views: &[CameraDepths]) -> Bounds {
     let known = views.iter().filter_map(|(_, depths)| *depths);
     let near = known.clone().map(|d| 0.5 * d[0]).fold(0.05 * radius, f64::min);
     let far = known.map(|d| 10.0 * d[1]).fold(100.0 * radius, f64::max);
-    let (min, max) = if faces_outward {
-        let half = DVec3::splat(radius);
-        ((centre - half).to_array(), (centre + half).to_array())
-    } else {
-        (boxed.min, boxed.max)
-    };
-    Bounds { min, max, near, far, space: Space::Contraction }
+    let contracted = Bounds { near, far, space: Space::Contraction, ..boxed };
+    if !faces_outward {
+        return contracted;
+    }
+    let half = DVec3::splat(radius);
+    let (min, max) = ((centre - half).to_array(), (centre + half).to_array());
+    Bounds { min, max, ..contracted }
 }
 
 /// Number of cells along each side of the sampling grid over a fisheye image; chosen by hand.
@@ -286,14 +275,9 @@ fn box_bounds(views: &[CameraDepths]) -> Bounds {
     let widest = widths.into_iter().filter(|width| *width <= limit).fold(0.0, f64::max);
     // A twentieth more, for silhouettes that touch the image border.
     let half = if widest > 0.0 { 1.05 * widest } else { UNKNOWN_HALF_SIDE };
-    let box_only = Bounds {
-        min: (centre - DVec3::splat(half)).to_array(),
-        max: (centre + DVec3::splat(half)).to_array(),
-        near: 0.0,
-        far: 0.0,
-        space: Space::Box,
-    };
-    with_ray_range(box_only, &cameras)
+    let (min, max) = (centre - DVec3::splat(half), centre + DVec3::splat(half));
+    let (near, far) = ray_range(min, max, &cameras);
+    Bounds { min: min.to_array(), max: max.to_array(), near, far, space: Space::Box }
 }
 
 /// Half side of the box around cameras at one position, from which no depth follows; chosen by
@@ -349,9 +333,8 @@ fn frusta_bounds(views: &[CameraDepths]) -> Option<Bounds> {
     bounds.is_valid().then_some(bounds)
 }
 
-/// Sets near and far to the distances of the box's nearest and farthest point over all cameras.
-fn with_ray_range(bounds: Bounds, cameras: &[&Camera]) -> Bounds {
-    let (min, max) = (DVec3::from(bounds.min), DVec3::from(bounds.max));
+/// Returns the distances of a box's nearest and farthest point over all cameras.
+fn ray_range(min: DVec3, max: DVec3, cameras: &[&Camera]) -> (f64, f64) {
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
     for camera in cameras {
         let c = camera.centre();
@@ -359,7 +342,7 @@ fn with_ray_range(bounds: Bounds, cameras: &[&Camera]) -> Bounds {
         far = far.max((c - min).abs().max((c - max).abs()).length());
     }
     // Cameras inside the box skip a sliver, chosen by hand: no surface is on the lens.
-    Bounds { near: near.max(1e-3 * far), far, ..bounds }
+    (near.max(1e-3 * far), far)
 }
 
 #[cfg(test)]
@@ -579,11 +562,11 @@ mod tests {
         assert_eq!(chosen(Some([3.0, 40.0]), None), Ok(Space::Contraction));
         assert_eq!(chosen(Some([3.0, 40.0]), Some(SpaceKind::Box)), Ok(Space::Box));
         assert_eq!(chosen(None, Some(SpaceKind::Contraction)), Ok(Space::Contraction));
-        assert_eq!(chosen(Some([3.0, 5.0]), Some(SpaceKind::Ndc)), Err(SpaceError::NotForward));
+        assert_eq!(chosen(Some([3.0, 5.0]), Some(SpaceKind::Ndc)), Err(NOT_FORWARD));
         let single = [looking_at(DVec3::Y, DVec3::ZERO)];
         assert_eq!(
             scene_bounds(&sights(&single, None), &[], false, Some(SpaceKind::Ndc)),
-            Err(SpaceError::NoDepths)
+            Err(NO_DEPTHS)
         );
         assert_eq!(
             scene_bounds(&sights(&single, None), &[], false, None).map(|b| b.space),
@@ -615,7 +598,7 @@ mod tests {
             }
         }
         assert!(bounds.longest_side() < 24.0 && bounds.far < 11.1, "{bounds:?}");
-        assert_eq!(scene_bounds(&seen, &[], false, Some(SpaceKind::Ndc)), Err(SpaceError::Fisheye));
+        assert_eq!(scene_bounds(&seen, &[], false, Some(SpaceKind::Ndc)), Err(IS_FISHEYE));
         let known = scene_bounds(&seen, &[], false, None).unwrap();
         assert_eq!(known.space, Space::Box);
         let unknown = scene_bounds(&sights(&row, None), &[], true, None).unwrap();
@@ -630,7 +613,7 @@ mod tests {
                 false,
                 Some(SpaceKind::Ndc)
             ),
-            Err(SpaceError::Fisheye)
+            Err(IS_FISHEYE)
         );
         // A box around the region that the cameras face doesn't contain the cameras, however wide
         // their angle of view is.

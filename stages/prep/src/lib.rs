@@ -96,20 +96,22 @@ impl Stage for Prep {
         let split = split_views(&set, params)?;
         let warnings = check_poses(&set, &split)?;
         let images = ImagePlan::new(&set, &split, params)?;
-        let mut notes = set.notes.clone();
-        notes.push(images.note(&split));
+        let mut notes = Vec::new();
+        let mut log = |note: String| {
+            context.log_line(&note);
+            notes.push(note);
+        };
+        set.notes.iter().cloned().for_each(&mut log);
+        log(images.note(&split));
         if let Some(lr_width) = params.lr_width.filter(|_| !images.has_truth) {
-            notes.push(format!("lr_width {lr_width} has no effect with lr_source photographs"));
+            log(format!("lr_width {lr_width} has no effect with lr_source photographs"));
         }
         if params.hr_references > Params::default().hr_references && !images.has_truth {
             let note = "hr_references gives no references with lr_source photographs; it only \
                 removes test views of split paper";
-            notes.push(note.to_owned());
+            log(note.to_owned());
         }
-        notes.extend(warnings);
-        for note in &notes {
-            context.log_line(note);
-        }
+        warnings.into_iter().for_each(&mut log);
         let used = split.train.iter().chain(&split.test).map(|&i| &set.frames[i]);
         let threads = memory::thread_pool(context, used, &images)?;
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
@@ -122,15 +124,9 @@ impl Stage for Prep {
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
         let writer = SceneWriter::new(context, &plan);
         let space_note = space_note(&plan.bounds, background);
-        for note in border_notes.into_iter().chain([space_note]).chain(detail_note) {
-            context.log_line(&note);
-            notes.push(note);
-        }
+        border_notes.into_iter().chain([space_note]).chain(detail_note).for_each(&mut log);
         threads.install(|| writer.write())?;
-        for note in writer.warnings() {
-            context.log_line(&note);
-            notes.push(note);
-        }
+        writer.warnings().into_iter().for_each(&mut log);
         let summary = SceneSummary::new(&set, &plan, detail, notes);
         context.write_json("scene.json", &summary)?;
         context.write_summary(&summary.text())

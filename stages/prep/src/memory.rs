@@ -22,8 +22,10 @@ impl MemoryNeed {
         let reading = frame.reading_bytes().bad_input(frame_label(frame))?;
         let size = (frame.lens_intrinsics.width, frame.lens_intrinsics.height);
         let hr_size = images.sizes_of(&frame.intrinsics()).hr;
-        let hr_pixels = if images.has_truth { pixel_count(hr_size) } else { 0 };
-        let bytes = preparation_bytes(reading, pixel_count(size), hr_pixels);
+        let [pixels, hr_pixels] =
+            [size, hr_size].map(|(width, height)| u64::from(width) * u64::from(height));
+        let hr_pixels = if images.has_truth { hr_pixels } else { 0 };
+        let bytes = preparation_bytes(reading, pixels, hr_pixels);
         Ok(Self { bytes, frame: frame_label(frame), size })
     }
 
@@ -44,10 +46,6 @@ impl MemoryNeed {
     }
 }
 
-fn pixel_count((width, height): (u32, u32)) -> u64 {
-    u64::from(width) * u64::from(height)
-}
-
 /// Creates the threads that prepare images, at most as many as free memory allows for the largest
 /// image.
 pub(crate) fn thread_pool<'a>(
@@ -55,13 +53,10 @@ pub(crate) fn thread_pool<'a>(
     frames: impl Iterator<Item = &'a Frame>,
     images: &ImagePlan,
 ) -> anyhow::Result<ThreadPool> {
-    let mut largest: Option<MemoryNeed> = None;
-    for frame in frames {
-        let need = MemoryNeed::of(frame, images)?;
-        if largest.as_ref().is_none_or(|largest| need.bytes > largest.bytes) {
-            largest = Some(need);
-        }
-    }
+    let needs: Result<Vec<MemoryNeed>, Failure> =
+        frames.map(|frame| MemoryNeed::of(frame, images)).collect();
+    // The first of several.
+    let largest = needs?.into_iter().rev().max_by_key(|need| need.bytes);
     let mut count = context.threads;
     if let (Some(largest), Some(free)) = (largest, available_memory()?) {
         count = largest.max_concurrent(free)?.min(context.threads);

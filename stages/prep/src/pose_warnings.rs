@@ -37,26 +37,14 @@ pub(crate) fn warnings(training: &[Camera], test: &[Camera]) -> Vec<String> {
         );
     }
     found.extend(unresolved_positions(training));
-    let mut all: Vec<LabelledCamera> = Vec::new();
+    // Cameras with names for messages.
+    let mut all: Vec<(String, &Camera)> = Vec::new();
     for (cameras, split) in [(training, "training"), (test, "test")] {
-        all.extend(cameras.iter().map(|camera| LabelledCamera { camera, split }));
+        all.extend(cameras.iter().map(|camera| (format!("{split} view {}", camera.name), camera)));
     }
     found.extend(outliers(&all));
     found.extend(off_centre(&all));
     found
-}
-
-/// Camera with its part of the split; displays as `training view NAME`.
-#[derive(Clone, Copy)]
-struct LabelledCamera<'a> {
-    camera: &'a Camera,
-    split: &'static str,
-}
-
-impl std::fmt::Display for LabelledCamera<'_> {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} view {}", self.split, self.camera.name)
-    }
 }
 
 /// Detects cameras whose centres differ by rounding errors only, and cameras whose centres are
@@ -94,8 +82,8 @@ fn rounding_error(cameras: &[Camera]) -> f64 {
 }
 
 /// Detects cameras far from the others. Medians, unlike means, are insensitive to a few outliers.
-fn outliers(all: &[LabelledCamera]) -> Option<String> {
-    let centres: Vec<DVec3> = all.iter().map(|labelled| labelled.camera.centre()).collect();
+fn outliers(all: &[(String, &Camera)]) -> Option<String> {
+    let centres: Vec<DVec3> = all.iter().map(|(_, camera)| camera.centre()).collect();
     let middle = DVec3::from([0, 1, 2].map(|i| median(centres.iter().map(|centre| centre[i]))));
     let distances: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
     let usual = median(distances.iter().copied());
@@ -108,7 +96,7 @@ fn outliers(all: &[LabelledCamera]) -> Option<String> {
     let more = if far.len() > 1 { format!(" (and {} more)", far.len() - 1) } else { String::new() };
     Some(format!(
         "{} is {:.0} times as far from the middle of all cameras as usual{more}; check its pose",
-        all[first],
+        all[first].0,
         distances[first] / usual
     ))
 }
@@ -121,11 +109,11 @@ pub(crate) fn median(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// Detects principal points far from the image centre: usually intrinsics for another image size.
-fn off_centre(all: &[LabelledCamera]) -> Option<String> {
-    let off: Vec<&LabelledCamera> =
-        all.iter().filter(|labelled| is_off_centre(&labelled.camera.intrinsics)).collect();
-    let first = off.first()?;
-    let k = &first.camera.intrinsics;
+fn off_centre(all: &[(String, &Camera)]) -> Option<String> {
+    let off: Vec<&(String, &Camera)> =
+        all.iter().filter(|(_, camera)| is_off_centre(&camera.intrinsics)).collect();
+    let (first, camera) = off.first()?;
+    let k = &camera.intrinsics;
     Some(format!(
         "{} of {} have a principal point far from the image centre (first: {first} with \
         ({:.1}, {:.1}) in {}×{} pixels); check that cx and cy belong to this size",

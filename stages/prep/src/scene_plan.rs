@@ -64,7 +64,7 @@ fn bounds(
     let (train, test) = (camera_depths(train, given), camera_depths(test, given));
     let is_unbounded = background == Background::Opaque;
     let mut bounds = scene_bounds(&train, &test, is_unbounded, params.space)
-        .map_err(|error| Failure::Usage(error.to_string()))?;
+        .map_err(|reason| Failure::Usage(reason.to_owned()))?;
     if !bounds.is_valid() {
         return Err(Failure::BadInput(EMPTY_BOX.to_owned()));
     }
@@ -130,12 +130,7 @@ pub(crate) fn check_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, F
 
 /// Describes space and background for the log.
 pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
-    let background = match background {
-        Background::White => "white",
-        Background::Black => "black",
-        Background::Alpha => "alpha",
-        Background::Opaque => "opaque",
-    };
+    let background = format!("{background:?}").to_lowercase();
     let side = format_length(bounds.longest_side(), 3);
     let space = match bounds.space {
         Space::Box => format!(

@@ -55,11 +55,10 @@ impl Strips {
                 return None;
             }
         }
-        let is_frame = widths.iter().all(|width| *width > 0);
-        let is_wide = (0..4).any(|side| MIN_FRAME_RATIO * widths[side] > line_count(image, side));
         let first = (0..4).find(|side| widths[*side] > 0)?;
-        let colour = colours[first]?;
-        (!(is_frame && is_wide)).then_some(Self { widths, colour })
+        let strips = Self { widths, colour: colours[first]? };
+        let is_wide = (0..4).any(|side| MIN_FRAME_RATIO * widths[side] > line_count(image, side));
+        (!(strips.is_frame() && is_wide)).then_some(strips)
     }
 
     /// Returns the strips that nine in ten views have on the same sides, with median widths, and
@@ -153,7 +152,7 @@ fn corners(image: &Rgba8, [top, right, bottom, left]: [usize; 4]) -> Vec<[u8; 3]
 
 /// True if at least half of the pixels differ from a strip's colour.
 fn is_content(pixels: &[[u8; 3]], strip: [u8; 3]) -> bool {
-    let similar = pixels.iter().filter(|pixel| is_similar(**pixel, strip)).count();
+    let similar = count_similar(pixels, strip, MAX_STRIP_NOISE);
     !pixels.is_empty() && 100 * similar <= MAX_INSIDE_PERCENT * pixels.len()
 }
 
@@ -168,12 +167,13 @@ fn flat_colour(line: &[[u8; 3]]) -> Option<[u8; 3]> {
 }
 
 fn is_flat(line: &[[u8; 3]], colour: [u8; 3]) -> bool {
-    let similar = line.iter().filter(|pixel| is_similar(**pixel, colour)).count();
+    let similar = count_similar(line, colour, MAX_STRIP_NOISE);
     !line.is_empty() && 100 * similar >= MIN_FLAT_PERCENT * line.len()
 }
 
-fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
-    are_similar(colour, other, MAX_STRIP_NOISE)
+/// Returns the number of pixels that are similar to a colour.
+pub(crate) fn count_similar(pixels: &[[u8; 3]], colour: [u8; 3], noise: u8) -> usize {
+    pixels.iter().filter(|pixel| are_similar(**pixel, colour, noise)).count()
 }
 
 /// True if no channel differs by more than `noise` 8-bit levels.

@@ -6,8 +6,8 @@ use anyhow::Context as _;
 use artifact::{FailureExt as _, WARNING, bail_bad_input, format_count, printable};
 use dataset::{Clipping, Frame};
 use pixels::{
-    Channel, DEGRADATION_FILE, DEPTH_CHANNELS, Degradation, DepthMap, Kernel, Mask, Rgba8,
-    SampleType, read_exr, write_exr, write_png,
+    COLOUR_CHANNELS, Channel, DEGRADATION_FILE, DEPTH_CHANNELS, Degradation, DepthMap, Kernel,
+    Mask, Rgba8, SampleType, read_exr, write_exr, write_png,
 };
 use rayon::prelude::*;
 use scene::{VIEWS_FILE, View, Views, mask_file};
@@ -37,12 +37,13 @@ impl<'a> SceneWriter<'a> {
 
     /// Writes all subtrees.
     pub(crate) fn write(&self) -> anyhow::Result<()> {
-        self.write_images_of_training_frames()?;
-        self.write_train_and_downscaled_views()?;
-        self.write_train_cameras()?;
-        self.write_references()?;
-        self.write_images_of_test_frames()?;
-        self.write_truth_and_camera_views()
+        let ScenePlan { train, test, references, .. } = self.plan;
+        self.write_images(train, |i, frame| {
+            self.write_training_image(frame, references.contains(&i))
+        })?;
+        self.write_views_of_training_frames()?;
+        self.write_images(test, |_, frame| self.write_test_image(frame))?;
+        self.write_views_of_test_frames()
     }
 
     /// Returns warnings about pixels brighter than 1 and about frames that are masked entirely.
@@ -79,8 +80,8 @@ impl<'a> SceneWriter<'a> {
         ))
     }
 
-    fn write_views(&self, subtree: &str, views: Vec<View>) -> anyhow::Result<()> {
-        let views = Views::new(self.plan.background, self.plan.bounds, views);
+    fn write_views(&self, subtree: &str, views: impl Iterator<Item = View>) -> anyhow::Result<()> {
+        let views = Views::new(self.plan.background, self.plan.bounds, views.collect());
         self.context.write_json(&format!("{subtree}/{VIEWS_FILE}"), &views)
     }
 
@@ -96,104 +97,87 @@ impl<'a> SceneWriter<'a> {
         )
     }
 
-    /// Writes the views of `train`, the LR images, and of `downscaled`: LR images shrunk once more,
-    /// with the LR images as ground truth.
-    fn write_train_and_downscaled_views(&self) -> anyhow::Result<()> {
-        let images = &self.plan.images;
-        let train: Vec<View> = self.plan.train.iter().map(|f| self.training_view(f)).collect();
-        let downscaled = train.iter().map(|view| self.downscaled_view(view)).collect();
-        self.write_views("downscaled", downscaled)?;
-        self.write_views("train", train)?;
+    /// Writes the views of `train`, the LR images, of `downscaled`, LR images shrunk once more with
+    /// the LR images as ground truth, of `train-cameras`, the training cameras at HR size, and, if
+    /// there are any, of `references`, training views at HR size.
+    fn write_views_of_training_frames(&self) -> anyhow::Result<()> {
+        let ScenePlan { train, references, images, .. } = self.plan;
+        let lr_views = || train.iter().map(|frame| self.training_view(frame));
+        self.write_views("downscaled", lr_views().map(|view| self.downscaled_view(view)))?;
+        self.write_views("train", lr_views())?;
         self.write_degradation("train", images.kernel, images.sizes.hr)?;
         // `shrunk` downscales unrounded LR images by the box filter, which suits any scale.
         let kernel = if images.kernel == Kernel::Average { Kernel::Box } else { images.kernel };
-        self.write_degradation("downscaled", kernel, images.sizes.lr)
+        self.write_degradation("downscaled", kernel, images.sizes.lr)?;
+        self.write_views("train-cameras", train.iter().map(|frame| self.hr_view(frame)))?;
+        if references.is_empty() {
+            return Ok(());
+        }
+        let references = references.iter().map(|&i| train[i]);
+        self.write_views(
+            "references",
+            references.map(|frame| View {
+                image: Some(format!("images/{}.png", frame.name)),
+                mask: mask_path(frame),
+                ..self.hr_view(frame)
+            }),
+        )
     }
 
     fn training_view(&self, frame: &Frame) -> View {
-        let images = &self.plan.images;
         View {
-            image: Some(format!("images/{}.{}", frame.name, degrade::extension(images.kernel))),
+            image: Some(format!("images/{}.{}", frame.name, self.extension())),
             mask: mask_path(frame),
-            ..View::camera_only(images.lr_camera(&frame.camera()))
+            ..View::camera_only(self.plan.images.lr_camera(&frame.camera()))
         }
     }
 
-    fn downscaled_view(&self, view: &View) -> View {
+    fn downscaled_view(&self, view: View) -> View {
         let k = &view.camera.intrinsics;
         let (width, height) = self.plan.images.downscaled_size((k.width, k.height));
-        View { camera: view.camera.resized(width, height), ..view.clone() }
+        View { camera: view.camera.resized(width, height), ..view }
     }
 
-    /// Writes `train-cameras`, the training cameras at HR size.
-    fn write_train_cameras(&self) -> anyhow::Result<()> {
-        let ScenePlan { train, images, .. } = self.plan;
-        let views = train.iter().map(|f| View::camera_only(images.hr_camera(&f.camera())));
-        self.write_views("train-cameras", views.collect())
-    }
-
-    /// Writes the views of `references`, training views at HR size, if any.
-    fn write_references(&self) -> anyhow::Result<()> {
-        if self.plan.references.is_empty() {
-            return Ok(());
-        }
-        let frames = self.plan.references.iter().map(|&i| self.plan.train[i]);
-        self.write_views("references", frames.map(|frame| self.reference(frame)).collect())
-    }
-
-    fn reference(&self, frame: &Frame) -> View {
-        View {
-            image: Some(format!("images/{}.png", frame.name)),
-            mask: mask_path(frame),
-            ..View::camera_only(self.plan.images.hr_camera(&frame.camera()))
-        }
+    /// Returns the view of a frame's camera at HR size, without files.
+    fn hr_view(&self, frame: &Frame) -> View {
+        View::camera_only(self.plan.images.hr_camera(&frame.camera()))
     }
 
     /// Writes the views of `truth`, test views at HR size with their LR photographs, and of
     /// `cameras`, their cameras.
-    fn write_truth_and_camera_views(&self) -> anyhow::Result<()> {
-        let images = &self.plan.images;
-        let truth: Vec<View> = self.plan.test.iter().map(|frame| self.test_view(frame)).collect();
-        self.write_views(
-            "cameras",
-            truth.iter().map(|view| View::camera_only(view.camera.clone())).collect(),
-        )?;
+    fn write_views_of_test_frames(&self) -> anyhow::Result<()> {
+        let ScenePlan { test, images, .. } = self.plan;
+        self.write_views("cameras", test.iter().map(|frame| self.hr_view(frame)))?;
         self.write_degradation("truth", images.kernel, images.sizes.hr)?;
-        self.write_views("truth", truth)
+        self.write_views("truth", test.iter().map(|frame| self.test_view(frame)))
     }
 
     fn test_view(&self, frame: &Frame) -> View {
-        let images = &self.plan.images;
+        let (name, has_truth) = (&frame.name, self.plan.images.has_truth);
+        let has_depth = has_truth && frame.depth_file.is_some();
         View {
-            image: images.has_truth.then(|| format!("images/{}.png", frame.name)),
+            image: has_truth.then(|| format!("images/{name}.png")),
             mask: mask_path(frame),
-            depth: frame
-                .depth_file
-                .as_ref()
-                .filter(|_| images.has_truth)
-                .map(|_| format!("depth/{}.exr", frame.name)),
-            low_resolution: Some(format!(
-                "low/{}.{}",
-                frame.name,
-                degrade::extension(images.kernel)
-            )),
-            ..View::camera_only(images.hr_camera(&frame.camera()))
+            depth: has_depth.then(|| format!("depth/{name}.exr")),
+            low_resolution: Some(format!("low/{name}.{}", self.extension())),
+            ..self.hr_view(frame)
         }
     }
 
-    fn write_images_of_training_frames(&self) -> anyhow::Result<()> {
-        self.plan.train.par_iter().enumerate().try_for_each(|(i, frame)| {
-            self.context.check_interrupt()?;
-            self.write_training_image(frame, self.plan.references.contains(&i))?;
-            self.progress.add(1);
-            Ok(())
-        })
+    /// Returns the extension of LR files.
+    fn extension(&self) -> &'static str {
+        degrade::extension(self.plan.images.kernel)
     }
 
-    fn write_images_of_test_frames(&self) -> anyhow::Result<()> {
-        self.plan.test.par_iter().try_for_each(|frame| {
+    /// Writes the images of frames, several at a time.
+    fn write_images(
+        &self,
+        frames: &[&Frame],
+        write: impl Fn(usize, &Frame) -> anyhow::Result<()> + Sync,
+    ) -> anyhow::Result<()> {
+        frames.par_iter().enumerate().try_for_each(|(i, frame)| {
             self.context.check_interrupt()?;
-            self.write_test_image(frame)?;
+            write(i, frame)?;
             self.progress.add(1);
             Ok(())
         })
@@ -294,15 +278,12 @@ impl<'a> SceneWriter<'a> {
     }
 
     fn write_lr(&self, folder: &str, name: &str, image: &LrImage) -> anyhow::Result<()> {
-        let path = self.context.output_path(&format!(
-            "{folder}/{name}.{}",
-            degrade::extension(self.plan.images.kernel)
-        ))?;
+        let path = self.context.output_path(&format!("{folder}/{name}.{}", self.extension()))?;
         match image {
             LrImage::Bytes(image) => write_png(&path, image)?,
             LrImage::Floats(image) => {
-                let channels = ["R", "G", "B", "A"]
-                    .map(|name| Channel { name, sample_type: SampleType::Float });
+                let channels =
+                    COLOUR_CHANNELS.map(|name| Channel { name, sample_type: SampleType::Float });
                 write_exr(
                     &path,
                     (image.width, image.height),
@@ -336,15 +317,14 @@ impl<'a> SceneWriter<'a> {
         let map = DepthMap::of(&native)
             .with_context(|| format!("{}: depth requires channels Z and A", printable(&source)))
             .bad_input(frame_label(frame))?;
-        let native_size = [native.width, native.height];
-        if !frame.has_aspect_of(native.width as u32, native.height as u32) {
+        let native_size @ [columns, rows] = [native.width, native.height];
+        if !frame.has_aspect_of(columns as u32, rows as u32) {
             let k = frame.intrinsics();
             bail_bad_input!(
-                "{}: {}: depth has {}×{} pixels, its photograph {}×{}; aspect ratios must match",
+                "{}: {}: depth has {columns}×{rows} pixels, its photograph {}×{}; aspect ratios \
+                must match",
                 frame_label(frame),
                 printable(&source),
-                native.width,
-                native.height,
                 k.width,
                 k.height
             );

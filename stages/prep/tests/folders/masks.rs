@@ -281,7 +281,7 @@ fn transforms_cases() -> Vec<Case> {
                 write_transforms(folder, &content);
             },
             Expected::Refused(
-                "dataset: DIR/transforms.json: frame 1 (images/a1.png): DIR/masks/a1.png not found; remove the entry or restore the file",
+                "dataset: DIR/transforms.json: frame 1 (images/a1.png): DIR/masks/a1.png not found; restore or rename the file, or remove its entry",
             ),
         ),
     ]

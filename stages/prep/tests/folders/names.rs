@@ -169,7 +169,7 @@ pub(crate) fn cases() -> Vec<Case> {
             "a path out of the folder",
             |folder| write_frames(folder, "../data/images/a_#.png", "images/a_#.png"),
             Expected::Refused(
-                "dataset: DIR/transforms.json: frame 0 (../data/images/a_0.png): \"../data/images/a_0.png\" is not a path inside the folder; move this file to the folder above, and give that folder",
+                "dataset: DIR/transforms.json: frame 0 (../data/images/a_0.png): \"../data/images/a_0.png\" is not a path inside the folder; name a file in the folder, or move the list of names to the folder above, and give that folder",
             ),
         ),
         case(
@@ -290,7 +290,7 @@ pub(crate) fn cases() -> Vec<Case> {
             "Blender without an image",
             |folder| write_blender(folder, "./train/r_#", "train/x_#.png"),
             Expected::Refused(
-                "dataset: DIR/transforms_train.json: frame 0 (./train/r_0): DIR/train/r_0.png not found; remove the frame or restore the file",
+                "dataset: DIR/transforms_train.json: frame 0 (./train/r_0): DIR/train/r_0.png not found; restore or rename the file, or remove its entry",
             ),
         ),
     ]

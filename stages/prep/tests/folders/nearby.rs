@@ -95,7 +95,7 @@ fn place_cases() -> Vec<Case> {
                 write_binary_images(folder);
             },
             Expected::Refused(
-                "dataset: DIR/sparse/0/cameras.bin: file not found next to images.bin; copy all files of the model",
+                "dataset: DIR/sparse/0/cameras.bin: file not found; copy all files of the model",
             ),
         ),
         case(
@@ -141,7 +141,7 @@ fn model_cases() -> Vec<Case> {
                 write(folder.join("sparse/0/images.txt"), format!("# list\n{lines}"));
             },
             Expected::Refused(
-                "dataset: DIR/sparse/0/images.txt: line 3 should be the points of image 1 (an empty line if there are none)",
+                "dataset: DIR/sparse/0/images.txt: line 3: expected the points of image 1 (an empty line if there are none)",
             ),
         ),
         case(

@@ -3,7 +3,6 @@ use std::path::Path;
 use artifact::{WARNING, format_count};
 
 use crate::dataset::Dataset;
-use crate::error::DatasetError;
 use crate::file_status::is_file;
 use crate::format::Format;
 use crate::frame_file::{FrameFile, MissingImages, lookup_of};
@@ -13,7 +12,7 @@ use crate::split::Split;
 /// Reads `transforms_train.json` and, if it exists, `transforms_test.json`: NeRF's synthetic
 /// scenes. A missing image is an error; names may omit `.png`. Without test views the data set has
 /// no split.
-pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
+pub(crate) fn read(folder: &Path) -> anyhow::Result<Dataset> {
     let train_file = FrameFile::read(&folder.join("transforms_train.json"))?;
     let test_path = folder.join("transforms_test.json");
     let test_file = is_file(&test_path)?.then(|| FrameFile::read(&test_path)).transpose()?;
@@ -124,7 +123,8 @@ mod tests {
         std::fs::remove_file(&image).unwrap();
         let message = || Dataset::read(dir.path()).unwrap_err().to_string();
         assert!(
-            message().ends_with("r_0.png not found; remove the frame or restore the file"),
+            message()
+                .ends_with("r_0.png not found; restore or rename the file, or remove its entry"),
             "{}",
             message()
         );
@@ -174,7 +174,7 @@ mod tests {
             (transforms("1").replace("0.7", "NaN"), "camera_angle_x is NaN"),
             (format!("\u{feff}\u{feff}{}", transforms("1")), "line 1"),
             (transforms("2"), "not a rigid motion"),
-            (transforms("1").replace("0.7", "0"), "focal length inf"),
+            (transforms("1").replace("0.7", "0"), "camera_angle_x is 0; the angle must be between"),
             (transforms("1").replace("0.7", "3.2"), "between 0 and π"),
             (transforms("1").replace("./train/r_0", "../r_0"), "not a path inside"),
             (transforms("1").replace("r_0", "r_1"), "r_1.png not found"),

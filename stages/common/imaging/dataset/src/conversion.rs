@@ -2,10 +2,10 @@
 
 use std::fs::File;
 use std::io::Read as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::file_status::{name_text, parent_folder, path_text, sub_folders, visible_entries};
-use crate::photograph::is_image_name;
+use crate::photograph::{has_extension, is_image_name};
 use crate::unsupported::is_unsupported_name;
 
 const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
@@ -60,10 +60,6 @@ fn export_text(application: &str, sign: &Path, remedy: &str) -> String {
     format!("found a {application} export ({sign}), which is not supported; {remedy}")
 }
 
-fn has_extension(path: &Path, extension: &str) -> bool {
-    path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension))
-}
-
 /// Recognises exports of Polycam, Record3D, Metashape and RealityCapture, also in a folder's only
 /// sub-folder, as in an archive.
 pub(crate) fn find_export(folder: &Path) -> Option<String> {
@@ -87,25 +83,23 @@ fn find_polycam(folder: &Path) -> Option<String> {
     let mut cameras = ["corrected_cameras", "cameras"].map(|name| keyframes.join(name)).into_iter();
     let sign =
         cameras.find(|path| visible_entries(path).iter().any(|e| has_extension(e, "json")))?;
-    Some(export_text("Polycam", &sign, &conversion("polycam", &data)))
+    Some(export_text("Polycam", &sign, &conversion("polycam", &data, &data)))
 }
 
 fn find_record3d(folder: &Path) -> Option<String> {
-    let [has_exr, has_rgbd, has_rgb, has_depth, has_metadata, has_json] =
-        ["EXR_RGBD", "rgbd", "rgb", "depth", "metadata", "metadata.json"]
-            .map(|name| folder.join(name).exists());
-    let sign = if has_exr {
-        folder.join("EXR_RGBD")
-    } else if has_rgbd && has_metadata {
-        folder.join("rgbd")
-    } else if has_rgb && has_depth && (has_json || has_metadata) {
-        folder.join("rgb")
+    let has = |name: &str| folder.join(name).exists();
+    let (sign, is_video) = if has("EXR_RGBD") {
+        (folder.join("EXR_RGBD"), false)
+    } else if has("rgbd") && has("metadata") {
+        (folder.join("rgbd"), true)
+    } else if has("rgb") && has("depth") && (has("metadata.json") || has("metadata")) {
+        (folder.join("rgb"), false)
     } else {
-        visible_entries(folder).into_iter().find(|path| has_extension(path, "r3d"))?
+        let is_video = |path: &PathBuf| has_extension(path, "r3d");
+        (visible_entries(folder).into_iter().find(is_video)?, true)
     };
-    let data = if has_exr { sign.clone() } else { folder.to_path_buf() };
-    let command = conversion("record3d", &data);
-    let is_video = has_extension(&sign, "r3d") || name_text(&sign) == "rgbd";
+    let data = if has("EXR_RGBD") { &sign } else { folder };
+    let command = conversion("record3d", data, data);
     let remedy = if is_video {
         format!("export it from Record3D as EXR + JPG sequence, then {command}")
     } else {
@@ -126,10 +120,9 @@ fn find_reconstruction(folder: &Path) -> Option<String> {
             return None;
         };
         let images = folder.join("images");
-        let data = if images.is_dir() { images } else { folder.to_path_buf() };
+        let data = if images.is_dir() { &images } else { folder };
         let options = format!("{name} --{option} {}", shell_quoted(file));
-        let output = folder.to_path_buf();
-        Some(export_text(application, file, &conversion_to(&options, &data, &output)))
+        Some(export_text(application, file, &conversion(&options, data, folder)))
     })
 }
 
@@ -142,13 +135,9 @@ fn head_text(file: &Path) -> Option<String> {
     Some(String::from_utf8_lossy(&bytes).into_owned())
 }
 
-/// Returns nerfstudio's command that converts an application's export to a data set.
-fn conversion(application: &str, data: &Path) -> String {
-    conversion_to(application, data, data)
-}
-
-/// Returns nerfstudio's command with the output next to the folder `source`.
-fn conversion_to(application: &str, data: &Path, source: &Path) -> String {
+/// Returns nerfstudio's command that converts an application's export to a data set next to the
+/// folder `source`.
+fn conversion(application: &str, data: &Path, source: &Path) -> String {
     let mut output = source.as_os_str().to_owned();
     output.push("-nerfstudio");
     format!(

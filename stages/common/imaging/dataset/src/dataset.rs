@@ -3,7 +3,8 @@ use std::collections::BTreeSet;
 use artifact::{WARNING, format_count};
 use scene::{Camera, Intrinsics};
 
-use crate::error::{DatasetError, Reason};
+use crate::error::DatasetError;
+use crate::file_status::path_text;
 use crate::format::Format;
 use crate::frame::{Frame, Turn};
 use crate::split::Split;
@@ -77,9 +78,11 @@ impl Dataset {
         for frame in self.frames.iter_mut().filter(|f| f.has_distortion()) {
             let distortion = frame.lens_intrinsics.distortion;
             let pinhole = frame.lens_intrinsics.pinhole().ok_or_else(|| {
-                let problem = format!("lens distortion {distortion} leaves no pinhole image");
-                let reason = Reason::new(format!("{problem}; are its coefficients right?"));
-                DatasetError::format(&frame.image, reason)
+                DatasetError::Invalid(format!(
+                    "{}: lens distortion {distortion} leaves no pinhole image; are its \
+                    coefficients right?",
+                    path_text(&frame.image)
+                ))
             })?;
             frame.pinhole = Some(pinhole);
             if distortion.is_fisheye() {
@@ -111,9 +114,7 @@ impl Dataset {
             }
         }
         if count > 0 {
-            let [smallest, largest] = [smallest, largest].map(with_four_digits);
-            let range =
-                if smallest == largest { smallest } else { format!("{smallest} to {largest}") };
+            let range = range_text([smallest, largest].map(with_four_digits));
             self.notes.push(format!(
                 "{WARNING}rotations of {count} of {} have a scale of {range}, which is removed; \
                 centres are unchanged",
@@ -145,20 +146,14 @@ impl Dataset {
                 self.notes.push(format!("{subject} {text}"));
             }
         }
-        let sizes: BTreeSet<(u32, u32)> = self
-            .frames
-            .iter()
-            .map(|f| (f.lens_intrinsics.width, f.lens_intrinsics.height))
-            .collect();
-        if let (Some(first), Some(last), true) = (sizes.first(), sizes.last(), sizes.len() > 1) {
-            self.notes.push(format!(
-                "photographs have {} sizes, from {}×{} to {}×{}",
-                sizes.len(),
-                first.0,
-                first.1,
-                last.0,
-                last.1
-            ));
+        let lenses = self.frames.iter().map(|frame| frame.lens_intrinsics);
+        let sizes: BTreeSet<(u32, u32)> = lenses.map(|k| (k.width, k.height)).collect();
+        if let (Some((w, h)), Some((width, height))) = (sizes.first(), sizes.last())
+            && sizes.len() > 1
+        {
+            let count = sizes.len();
+            self.notes
+                .push(format!("photographs have {count} sizes, from {w}×{h} to {width}×{height}"));
         }
     }
 }
@@ -171,6 +166,11 @@ fn depths_of([nearest, farthest]: [f64; 2], camera: &Camera) -> [f64; 2] {
     [nearest * slopes.fold(1.0, f64::min), farthest]
 }
 
+/// Formats the range between two numbers, which may be equal.
+fn range_text([from, to]: [String; 2]) -> String {
+    if from == to { to } else { format!("{from} to {to}") }
+}
+
 /// Formats a number with at most four significant digits.
 fn with_four_digits(value: f64) -> String {
     let rounded = format!("{value:.3e}").parse().unwrap_or(value);
@@ -179,19 +179,12 @@ fn with_four_digits(value: f64) -> String {
 
 /// Describes the pinhole cameras in place of fisheye cameras, by their fields of view in degrees.
 fn angles_note(angles: &[[f64; 2]]) -> Option<String> {
-    let first = angles.first()?;
-    let [mut narrowest, mut widest] = [first, first];
-    for angles in angles {
-        narrowest = if angles[0] < narrowest[0] { angles } else { narrowest };
-        widest = if angles[0] > widest[0] { angles } else { widest };
-    }
-    let [narrowest, widest] =
-        [narrowest, widest].map(|[across, down]| format!("{across:.1}°×{down:.1}°"));
-    let range = if narrowest == widest { widest } else { format!("{narrowest} to {widest}") };
-    let (subject, cameras) = (
-        counted_with_verb(angles.len(), "fisheye photograph", ["is", "are"]),
-        if angles.len() == 1 { "a pinhole camera" } else { "pinhole cameras" },
-    );
+    let narrowest = angles.iter().min_by(|a, b| a[0].total_cmp(&b[0]))?;
+    let widest = angles.iter().max_by(|a, b| a[0].total_cmp(&b[0]))?;
+    let range =
+        range_text([narrowest, widest].map(|[across, down]| format!("{across:.1}°×{down:.1}°")));
+    let subject = counted_with_verb(angles.len(), "fisheye photograph", ["is", "are"]);
+    let cameras = if angles.len() == 1 { "a pinhole camera" } else { "pinhole cameras" };
     Some(format!(
         "{subject} resampled to {cameras} with a field of view of {range}; the rest is cropped"
     ))

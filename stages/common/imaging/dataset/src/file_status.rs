@@ -1,40 +1,23 @@
 //! Checks of paths that should be files.
 
 use std::fs;
-use std::io::{self, ErrorKind};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use artifact::{file_kind, is_ignored_name, printable, shortened};
 
-use crate::error::DatasetError;
-
-/// Result of checking a path.
-#[derive(Debug)]
-pub(crate) enum FileStatus {
-    File,
-    Missing(FileProblem),
-    /// Something that can't be read as a file.
-    Unusable(FileProblem),
-}
-
 /// Reason why a path isn't a readable file.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum FileProblem {
-    /// Nothing at the path, or something that isn't a file or can't be accessed.
+    /// Nothing at the path.
     #[error("{0}")]
-    Other(String),
-    /// Link to a missing target, at the path or above it.
-    #[error(
-        "{} is a symbolic link to {}, which does not exist",
-        path_text(link),
-        path_text(target)
-    )]
-    LinkToNothing { link: PathBuf, target: PathBuf },
+    Missing(String),
     /// Link that can't be followed, at the path or above it.
-    #[error("{} is a symbolic link that cannot be followed: {error}", path_text(link))]
-    UnfollowableLink { link: PathBuf, error: io::Error },
-    #[error("{} is named like editor and system files, which are ignored", path_text(path))]
-    IgnoredName { path: PathBuf },
+    #[error("{0}")]
+    Link(String),
+    /// Something that isn't a file or can't be accessed.
+    #[error("{0}")]
+    Unusable(String),
 }
 
 /// Returns a path for a message, on one line; bytes that aren't UTF-8 are escaped as `\xFF`.
@@ -48,41 +31,44 @@ pub(crate) fn path_text(path: &Path) -> String {
 /// Maximum length of a path in bytes, including a final NUL (Linux's `PATH_MAX`).
 const MAX_PATH_BYTES: usize = 4096;
 
-/// Checks a path; `expected` describes the expected file in messages ("an image").
-pub(crate) fn file_status(path: &Path, expected: &str) -> FileStatus {
+/// Fails unless a path is a file; `expected` describes the expected file in messages ("an image").
+pub(crate) fn check_file(path: &Path, expected: &str) -> Result<(), FileProblem> {
     let name = path_text(path);
-    let too_long = || {
-        let bytes = path.as_os_str().len();
-        FileProblem::Other(format!("{}: path is too long ({bytes} bytes)", shortened(&name)))
-    };
-    if path.as_os_str().len() >= MAX_PATH_BYTES {
-        return FileStatus::Unusable(too_long());
+    let short_name = shortened(&name);
+    let length = path.as_os_str().len();
+    if length >= MAX_PATH_BYTES {
+        let problem = format!("{short_name}: path is too long ({length} bytes)");
+        return Err(FileProblem::Unusable(problem));
     }
     if path.file_name().is_some_and(is_ignored_name) {
-        return FileStatus::Unusable(FileProblem::IgnoredName { path: path.to_path_buf() });
+        let problem = format!("{name} is named like editor and system files, which are ignored");
+        return Err(FileProblem::Unusable(problem));
     }
     let error = match fs::metadata(path) {
-        Ok(found) if found.is_file() => return FileStatus::File,
+        Ok(found) if found.is_file() => return Ok(()),
         Ok(found) => {
             let problem = format!("{name} is {}, not {expected}", file_kind(found.file_type()));
-            return FileStatus::Unusable(FileProblem::Other(problem));
+            return Err(FileProblem::Unusable(problem));
         }
         Err(error) => error,
     };
-    FileStatus::Unusable(match (first_bad_link(path), error.kind()) {
-        (Some(link), ErrorKind::NotFound) => {
-            let target = fs::read_link(link).unwrap_or_default();
-            FileProblem::LinkToNothing { link: link.to_path_buf(), target }
+    Err(match (first_bad_link(path), error.kind()) {
+        (Some(link), kind) => {
+            let target = path_text(&fs::read_link(link).unwrap_or_default());
+            let link = path_text(link);
+            FileProblem::Link(if kind == ErrorKind::NotFound {
+                format!("{link} is a symbolic link to {target}, which does not exist")
+            } else {
+                format!("{link} is a symbolic link that cannot be followed: {error}")
+            })
         }
-        (Some(link), _) => FileProblem::UnfollowableLink { link: link.to_path_buf(), error },
-        (None, ErrorKind::InvalidFilename) => FileProblem::Other(format!(
-            "{}: a name in the path is too long (usual maximum 255 bytes)",
-            shortened(&name)
+        (None, ErrorKind::InvalidFilename) => FileProblem::Unusable(format!(
+            "{short_name}: a name in the path is too long (usual maximum 255 bytes)"
         )),
         (None, ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-            return FileStatus::Missing(FileProblem::Other(format!("{name} not found")));
+            FileProblem::Missing(format!("{name} not found"))
         }
-        (None, _) => FileProblem::Other(format!("cannot access {name}: {error}")),
+        (None, _) => FileProblem::Unusable(format!("cannot access {name}: {error}")),
     })
 }
 
@@ -129,21 +115,19 @@ pub(crate) fn name_text(path: &Path) -> &str {
 }
 
 /// Fails if a path is, or leads through, a link that can't be followed.
-pub(crate) fn check_link(path: &Path) -> Result<(), DatasetError> {
-    match file_status(path, "a folder") {
-        FileStatus::Unusable(
-            problem @ (FileProblem::LinkToNothing { .. } | FileProblem::UnfollowableLink { .. }),
-        ) => Err(problem.into()),
+pub(crate) fn check_link(path: &Path) -> Result<(), FileProblem> {
+    match check_file(path, "a folder") {
+        Err(problem @ FileProblem::Link(_)) => Err(problem),
         _ => Ok(()),
     }
 }
 
 /// Returns whether a file exists; fails if something else is in its place.
-pub(crate) fn is_file(path: &Path) -> Result<bool, DatasetError> {
-    match file_status(path, "a file") {
-        FileStatus::File => Ok(true),
-        FileStatus::Missing(_) => Ok(false),
-        FileStatus::Unusable(problem) => Err(problem.into()),
+pub(crate) fn is_file(path: &Path) -> Result<bool, FileProblem> {
+    match check_file(path, "a file") {
+        Ok(()) => Ok(true),
+        Err(FileProblem::Missing(_)) => Ok(false),
+        Err(problem) => Err(problem),
     }
 }
 
@@ -168,8 +152,8 @@ mod tests {
         symlink("loop", path("loop")).unwrap();
         symlink("gone", path("dangling")).unwrap();
         symlink("file", path("link")).unwrap();
-        let found = |name: &str| file_status(&path(name), "an image");
-        assert!(matches!((found("file"), found("link")), (FileStatus::File, FileStatus::File)));
+        let found = |name: &str| check_file(&path(name), "an image");
+        assert!(found("file").is_ok() && found("link").is_ok());
         for (name, expected) in [
             ("folder", "folder is a folder, not an image"),
             ("pipe", "pipe is a named pipe (FIFO), not an image"),
@@ -183,18 +167,16 @@ mod tests {
             (&"y".repeat(300), ": a name in the path is too long"),
             (&"z/".repeat(1 << 20), ": path is too long"),
         ] {
-            let FileStatus::Unusable(problem) = found(name) else {
-                panic!("{name}: {:?}", found(name))
-            };
+            let problem = found(name).unwrap_err();
+            assert!(!matches!(problem, FileProblem::Missing(_)), "{problem}");
             let text = problem.to_string();
             assert!(text.contains(expected), "{text}");
         }
         for (name, expected) in
             [("nothing", "nothing not found"), ("file/x.png", "file/x.png not found")]
         {
-            let FileStatus::Missing(problem) = found(name) else {
-                panic!("{name}: {:?}", found(name))
-            };
+            let problem = found(name).unwrap_err();
+            assert!(matches!(problem, FileProblem::Missing(_)), "{problem}");
             let text = problem.to_string();
             assert!(text.contains(expected), "{text}");
         }

@@ -2,11 +2,12 @@ use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context as _, bail, ensure};
 use artifact::shortened;
 use glam::{DMat3, DVec3};
 use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of, without_scale};
 
-use crate::error::{DatasetError, Reason};
+use crate::error::frame_label;
 use crate::file_status::path_text;
 use crate::masks::MaskFile;
 
@@ -126,7 +127,7 @@ pub(crate) fn assign_names(
     frames: &mut [Frame],
     list: &Path,
     paths: &[PathBuf],
-) -> Result<(), DatasetError> {
+) -> anyhow::Result<()> {
     for (i, name) in unique_names(list, paths)?.into_iter().enumerate() {
         frames[i].name = name;
     }
@@ -134,7 +135,7 @@ pub(crate) fn assign_names(
 }
 
 /// Returns unique names of images, see [`assign_names`]: all file names, or all names with folders.
-pub(crate) fn unique_names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
+pub(crate) fn unique_names(list: &Path, paths: &[PathBuf]) -> anyhow::Result<Vec<String>> {
     let mut names = each_name(list, paths, |path| printable_part(path.file_stem()))?;
     for separator in SEPARATORS {
         if first_duplicate(&names).is_none() {
@@ -142,37 +143,28 @@ pub(crate) fn unique_names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>
         }
         names = each_name(list, paths, |path| name_with_folders(path, separator))?;
     }
-    match first_duplicate(&names) {
-        None => Ok(names),
-        Some((first, second)) => {
-            let reason = Reason::new(if paths[first] == paths[second] {
-                "the photograph is listed twice; remove one of the two entries".to_owned()
-            } else {
-                let (name, first) = (shortened(&names[second]), path_text(&paths[first]));
-                format!(
-                    "view name {name:?} is already that of {}; rename one of the two files",
-                    shortened(&first)
-                )
-            });
-            Err(DatasetError::frame(list, second, &path_text(&paths[second]), reason))
-        }
+    let Some((first, second)) = first_duplicate(&names) else { return Ok(names) };
+    let [first_path, path] = [first, second].map(|i| path_text(&paths[i]));
+    let label = frame_label(list, second, &path);
+    if first_path == path {
+        bail!("{label}: the photograph is listed twice; remove one of the two entries");
     }
+    let (name, first) = (shortened(&names[second]), shortened(&first_path));
+    bail!("{label}: view name {name:?} is already that of {first}; rename one of the two files")
 }
 
 fn each_name(
     list: &Path,
     paths: &[PathBuf],
-    name: impl Fn(&Path) -> Result<String, Reason>,
-) -> Result<Vec<String>, DatasetError> {
-    let mut names = Vec::with_capacity(paths.len());
-    for (index, path) in paths.iter().enumerate() {
-        let name = name(path).map_err(|e| DatasetError::frame(list, index, &path_text(path), e))?;
-        names.push(name);
-    }
-    Ok(names)
+    name: impl Fn(&Path) -> anyhow::Result<String>,
+) -> anyhow::Result<Vec<String>> {
+    let named = |(index, path): (usize, &PathBuf)| {
+        name(path).with_context(|| frame_label(list, index, &path_text(path)))
+    };
+    paths.iter().enumerate().map(named).collect()
 }
 
-fn name_with_folders(path: &Path, separator: &str) -> Result<String, Reason> {
+fn name_with_folders(path: &Path, separator: &str) -> anyhow::Result<String> {
     let path = path.with_extension("");
     let parts =
         path.iter().map(|part| printable_part(Some(part))).collect::<Result<Vec<_>, _>>()?;
@@ -181,12 +173,12 @@ fn name_with_folders(path: &Path, separator: &str) -> Result<String, Reason> {
 
 /// Returns a part of a path as text without control characters: names become file names and are
 /// printed. Fails for the folders `.` and `..`, the stems of `..png` and `...png`.
-fn printable_part(part: Option<&OsStr>) -> Result<String, Reason> {
-    let name = part.and_then(OsStr::to_str);
-    let name = name.ok_or_else(|| Reason::new("file name is not UTF-8; rename the file"))?;
-    if [".", ".."].contains(&name) {
-        return Err(Reason::new("file name has only dots before its extension; rename the file"));
-    }
+fn printable_part(part: Option<&OsStr>) -> anyhow::Result<String> {
+    let name = part.and_then(OsStr::to_str).context("file name is not UTF-8; rename the file")?;
+    ensure!(
+        ![".", ".."].contains(&name),
+        "file name has only dots before its extension; rename the file"
+    );
     Ok(name.replace(char::is_control, "_"))
 }
 
@@ -205,8 +197,8 @@ fn first_duplicate(names: &[String]) -> Option<(usize, usize)> {
 mod tests {
     use super::*;
 
-    fn names_of(paths: &[&str]) -> Result<Vec<String>, DatasetError> {
-        unique_names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>())
+    fn names_of(paths: &[&str]) -> Result<Vec<String>, crate::DatasetError> {
+        Ok(unique_names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>())?)
     }
 
     #[test]
@@ -240,10 +232,9 @@ mod tests {
         }
         let path =
             <std::ffi::OsStr as std::os::unix::ffi::OsStrExt>::from_bytes(b"images/\xff\xfe.png");
-        let message =
-            unique_names("list".as_ref(), &[PathBuf::from(path)]).unwrap_err().to_string();
+        let error = unique_names("list".as_ref(), &[PathBuf::from(path)]).unwrap_err();
         assert_eq!(
-            message,
+            format!("{error:#}"),
             "list: frame 0 (images/\\xFF\\xFE.png): file name is not UTF-8; rename the file"
         );
     }

@@ -78,10 +78,10 @@ impl Table {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Band {
     /// First and last coefficient in zigzag order; 0 is DC.
-    first: u32,
-    last: u32,
+    pub(crate) first: u32,
+    pub(crate) last: u32,
     /// True if the scan adds a lower bit to known coefficients (successive approximation).
-    is_refinement: bool,
+    pub(crate) is_refinement: bool,
 }
 
 impl Band {
@@ -97,18 +97,6 @@ impl Band {
             last: u32::from(last),
             is_refinement: approximation >> 4 > 0,
         })
-    }
-
-    pub(crate) fn has_dc(self) -> bool {
-        self.first == 0
-    }
-
-    pub(crate) fn has_ac(self) -> bool {
-        self.last > 0
-    }
-
-    pub(crate) fn is_refinement(self) -> bool {
-        self.is_refinement
     }
 }
 
@@ -144,24 +132,14 @@ impl<'a> Bits<'a> {
             None => 1,
         };
         self.skip(length)?;
-        let Some(ac) = ac else { return Some(()) };
-        let mut coefficient = 1;
-        while coefficient <= band.last {
-            match self.run_and_length(ac)? {
-                // ZRL: sixteen zeros.
-                (15, 0) => coefficient += 16,
-                (_, 0) => break,
-                (zeros, length) => {
-                    self.skip(length)?;
-                    coefficient += zeros + 1;
-                }
-            }
+        match ac {
+            Some(ac) => self.skip_band(Band { first: 1, ..band }, ac, &mut 0),
+            None => Some(()),
         }
-        Some(())
     }
 
-    /// Skips a block of a progressive scan without DC (G.1.2.2 and G.1.2.3). `known` has the bits
-    /// of non-zero coefficients; those of new ones are added.
+    /// Skips the AC coefficients of a block, also of a progressive scan (G.1.2.2 and G.1.2.3).
+    /// `known` has the bits of non-zero coefficients; those of new ones are added.
     pub(crate) fn skip_band(&mut self, band: Band, table: &Table, known: &mut u64) -> Option<()> {
         let mut coefficient = band.first;
         while self.empty_blocks == 0 && coefficient <= band.last {

@@ -6,10 +6,9 @@
 //! pixel is missing. A progressive JPEG needs its end marker, since nothing else determines the
 //! number of scans.
 //!
-//! An invalid segment before the first scan is left to the decoder, which reports it; if it
-//! doesn't, the file is refused. The decoder ignores an invalid scan header, and any invalid
-//! segment after the first scan. Here either ends the image data: a sequential JPEG whose rows are
-//! complete by then is accepted.
+//! A file with an invalid segment before the first scan is refused. The decoder ignores an invalid
+//! scan header, and any invalid segment after the first scan. Here either ends the image data: a
+//! sequential JPEG whose rows are complete by then is accepted.
 
 use std::ops::{Range, RangeInclusive};
 
@@ -45,8 +44,7 @@ fn is_known_marker(marker: u8) -> bool {
 pub(crate) enum Completeness {
     /// Complete data.
     Complete,
-    /// Invalid segment before the first scan, or no frame header: the decoder should refuse the
-    /// file.
+    /// Invalid segment before the first scan, or no frame header.
     UnreadableHeader,
     /// Complete rows without an end marker that the decoder reaches. The image data end at offset
     /// `end`.
@@ -190,7 +188,7 @@ impl<'a> Walk<'a> {
         let single = if let [part] = &parts[..] { Some(part.component) } else { None };
         let grid = Grid::new(frame, single);
         let mut bits = Bits::new(self.bytes, self.offset);
-        let missing = if band.has_dc() {
+        let missing = if band.first == 0 {
             let blocks = block_tables(&parts, frame, &self.tables, band)?;
             grid.incomplete_rows(&mut bits, self.restart_interval, |bits, _| {
                 for tables in &blocks {
@@ -259,8 +257,8 @@ fn block_tables<'a>(
     for Part { component, tables: [dc, ac] } in parts {
         let [across, down] = frame.components[*component].factors;
         let count = if parts.len() == 1 { 1 } else { across * down };
-        let dc = if band.is_refinement() { None } else { Some(tables[0].get(*dc)?.as_ref()?) };
-        let ac = if band.has_ac() { Some(tables[1].get(*ac)?.as_ref()?) } else { None };
+        let dc = if band.is_refinement { None } else { Some(tables[0].get(*dc)?.as_ref()?) };
+        let ac = if band.last > 0 { Some(tables[1].get(*ac)?.as_ref()?) } else { None };
         blocks.extend((0..count).map(|_| [dc, ac]));
     }
     Some(blocks)

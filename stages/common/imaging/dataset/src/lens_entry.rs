@@ -1,10 +1,9 @@
+use anyhow::{anyhow, bail};
 use artifact::shortened;
 use scene::Distortion;
-use serde::Deserialize;
 use serde_json::Value;
 
-use crate::error::Reason;
-use crate::number::Number;
+use crate::entry::Entry;
 
 /// Names of camera models; case is ignored.
 const PERSPECTIVE_MODELS: [&str; 6] =
@@ -15,126 +14,52 @@ const FISHEYE_MODELS: [&str; 5] =
 /// Names of panoramas in longitude and latitude.
 const PANORAMAS: [&str; 2] = ["equirectangular", "latlong"];
 
-/// Lens of all frames of a `transforms.json`, or of one, with instant-ngp's and nerfstudio's keys.
-#[derive(Clone, Default, Deserialize)]
-pub(crate) struct LensEntry {
-    camera_model: Option<String>,
-    pub(crate) camera_angle_x: Option<Number>,
-    pub(crate) camera_angle_y: Option<Number>,
-    pub(crate) fl_x: Option<Number>,
-    pub(crate) fl_y: Option<Number>,
-    pub(crate) cx: Option<Number>,
-    pub(crate) cy: Option<Number>,
-    pub(crate) w: Option<Number>,
-    pub(crate) h: Option<Number>,
-    k1: Option<Number>,
-    k2: Option<Number>,
-    k3: Option<Number>,
-    k4: Option<Number>,
-    k5: Option<Number>,
-    k6: Option<Number>,
-    p1: Option<Number>,
-    p2: Option<Number>,
-    is_fisheye: Option<bool>,
-    // Other projections of instant-ngp, which are not supported.
-    equirectangular: Option<Value>,
-    latlong: Option<Value>,
-    orthographic: Option<Value>,
-    ftheta_p0: Option<Value>,
+/// Returns the distortion of a frame's lens, with instant-ngp's and nerfstudio's keys; fails for a
+/// model that isn't supported. For a fisheye lens k1 to k4 are OpenCV's. For a perspective lens k4 is
+/// Brown's fourth radial term, as in nerfstudio, unless the model is OpenCV's rational one, the only
+/// one with k5 and k6.
+pub(crate) fn distortion(entry: &Entry) -> anyhow::Result<Distortion> {
+    if let Some(model) = unsupported_projection(entry) {
+        bail!(unsupported_model(model));
+    }
+    let mut coefficients = [0.0; 8];
+    for (i, key) in ["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"].into_iter().enumerate() {
+        coefficients[i] = entry.number(key)?.unwrap_or(0.0);
+    }
+    let [k1, k2, k3, k4, k5, k6, p1, p2] = coefficients;
+    let tangential = [p1, p2];
+    let model = entry.text("camera_model")?.unwrap_or("OPENCV");
+    let is_marked = entry.flag("is_fisheye")? == Some(true);
+    let is_in = |models: &[&str]| models.iter().any(|name| name.eq_ignore_ascii_case(model));
+    let (is_fisheye, is_rational) = if is_in(&PERSPECTIVE_MODELS) {
+        (is_marked, k5 != 0.0 || k6 != 0.0)
+    } else if is_in(&[RATIONAL_MODEL]) {
+        (is_marked, true)
+    } else if is_in(&FISHEYE_MODELS) {
+        (true, false)
+    } else {
+        bail!(unsupported_model(model));
+    };
+    let radial = [k1, k2, k3, k4];
+    Ok(if is_fisheye {
+        Distortion { tangential, ..Distortion::fisheye(radial) }
+    } else if is_rational {
+        let numerator = Distortion::brown([k1, k2, k3], tangential);
+        Distortion { denominator: [k4, k5, k6], ..numerator }
+    } else {
+        Distortion { radial, tangential, ..Distortion::default() }
+    })
 }
 
-impl LensEntry {
-    /// Returns this entry, completed from `other`. An angle of view of this entry takes the place of
-    /// the other's focal length.
-    pub(crate) fn or(&self, other: &Self) -> Self {
-        macro_rules! both {
-            ($($name:ident),*) => {
-                Self { $($name: self.$name.clone().or_else(|| other.$name.clone())),* }
-            };
-        }
-        let mut entry = both!(
-            camera_model,
-            camera_angle_x,
-            camera_angle_y,
-            fl_x,
-            fl_y,
-            cx,
-            cy,
-            w,
-            h,
-            k1,
-            k2,
-            k3,
-            k4,
-            k5,
-            k6,
-            p1,
-            p2,
-            is_fisheye,
-            equirectangular,
-            latlong,
-            orthographic,
-            ftheta_p0
-        );
-        if self.camera_angle_x.is_some() {
-            entry.fl_x = self.fl_x;
-        }
-        if self.camera_angle_y.is_some() {
-            entry.fl_y = self.fl_y;
-        }
-        entry
-    }
-
-    /// Returns the distortion; fails for a model that isn't supported. For a fisheye lens k1 to k4
-    /// are OpenCV's. For a perspective lens k4 is Brown's fourth radial term, as in nerfstudio,
-    /// unless the model is OpenCV's rational one, the only one with k5 and k6.
-    pub(crate) fn distortion(&self) -> Result<Distortion, Reason> {
-        if let Some(model) = self.unsupported_projection() {
-            return Err(unsupported_model(model));
-        }
-        let [k1, k2, k3, k4, k5, k6, p1, p2] =
-            [self.k1, self.k2, self.k3, self.k4, self.k5, self.k6, self.p1, self.p2]
-                .map(|coefficient| coefficient.map_or(0.0, |number| number.0));
-        let tangential = [p1, p2];
-        let model = self.camera_model.as_deref().unwrap_or("OPENCV");
-        let is_in = |models: &[&str]| models.iter().any(|name| name.eq_ignore_ascii_case(model));
-        let (is_fisheye, is_rational) = if is_in(&PERSPECTIVE_MODELS) {
-            (self.is_fisheye == Some(true), k5 != 0.0 || k6 != 0.0)
-        } else if is_in(&[RATIONAL_MODEL]) {
-            (self.is_fisheye == Some(true), true)
-        } else if is_in(&FISHEYE_MODELS) {
-            (true, false)
-        } else {
-            return Err(unsupported_model(model));
-        };
-        let radial = [k1, k2, k3, k4];
-        Ok(if is_fisheye {
-            Distortion { tangential, ..Distortion::fisheye(radial) }
-        } else if is_rational {
-            let numerator = Distortion::brown([k1, k2, k3], tangential);
-            Distortion { denominator: [k4, k5, k6], ..numerator }
-        } else {
-            Distortion { radial, tangential, ..Distortion::default() }
-        })
-    }
-
-    /// Returns the name of instant-ngp's projection if it isn't supported.
-    fn unsupported_projection(&self) -> Option<&'static str> {
-        for (name, flag) in [
-            ("equirectangular", &self.equirectangular),
-            ("latlong", &self.latlong),
-            ("orthographic", &self.orthographic),
-        ] {
-            if *flag == Some(Value::Bool(true)) {
-                return Some(name);
-            }
-        }
-        self.ftheta_p0.as_ref().map(|_| "ftheta")
-    }
+/// Returns the name of instant-ngp's projection if it isn't supported.
+fn unsupported_projection(entry: &Entry) -> Option<&'static str> {
+    let is_set = |name: &&str| entry.value(name) == Some(&Value::Bool(true));
+    let found = ["equirectangular", "latlong", "orthographic"].into_iter().find(is_set);
+    found.or_else(|| entry.has("ftheta_p0").then_some("ftheta"))
 }
 
-/// Returns the reason for a camera model that isn't supported.
-fn unsupported_model(model: &str) -> Reason {
+/// Returns the error for a camera model that isn't supported.
+fn unsupported_model(model: &str) -> anyhow::Error {
     let remedy = if PANORAMAS.iter().any(|name| name.eq_ignore_ascii_case(model)) {
         "cut the panoramas into views and estimate their cameras: ns-process-data images \
         --camera-type equirectangular"
@@ -144,5 +69,5 @@ fn unsupported_model(model: &str) -> Reason {
         let known = known.join(", ");
         format!("undistort the images first (colmap image_undistorter); supported are {known}")
     };
-    Reason::new(format!("camera_model {:?} is not supported; {remedy}", shortened(model)))
+    anyhow!("camera_model {:?} is not supported; {remedy}", shortened(model))
 }

@@ -20,13 +20,14 @@
 //! let set = dataset::Dataset::read("my-photographs".as_ref())?;
 //! println!("{}: {} photographs", set.format, set.frames.len());
 //! let (image, camera) = (set.frames[0].photograph()?, set.frames[0].camera());
-//! # Ok::<(), dataset::DatasetError>(())
+//! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
 mod blender;
 mod colmap;
 mod conversion;
 mod dataset;
+mod entry;
 mod error;
 mod file_status;
 mod format;
@@ -40,7 +41,6 @@ mod lookup;
 mod masks;
 mod nearby;
 mod npy;
-mod number;
 mod photograph;
 mod split;
 mod text;
@@ -50,13 +50,14 @@ mod unused_masks;
 
 use std::path::Path;
 
+use anyhow::bail;
 use artifact::printable;
 
 pub use dataset::Dataset;
 pub use error::DatasetError;
-use error::Problem;
-use file_status::is_file;
+use file_status::{is_file, path_text};
 pub use format::Format;
+use format::expected_files;
 pub use frame::{Frame, Turn};
 use masks::add_masks;
 pub use masks::{MaskFile, MaskKind};
@@ -68,7 +69,16 @@ pub use unsupported::{is_unsupported_name, unsupported_summary};
 impl Dataset {
     /// Reads a folder in any format. Of the images only the headers are read.
     pub fn read(folder: &Path) -> Result<Self, DatasetError> {
-        let mut set = read_format(recognise_format(folder)?, folder)?;
+        Ok(Self::read_recognised(folder)?)
+    }
+
+    fn read_recognised(folder: &Path) -> anyhow::Result<Self> {
+        let mut set = match recognise_format(folder)? {
+            Format::Blender => blender::read(folder),
+            Format::Transforms => transforms::read(folder),
+            Format::Llff => llff::read(folder),
+            Format::Colmap => colmap::read(folder),
+        }?;
         add_masks(folder, &mut set)?;
         set.remove_scales();
         set.add_image_notes();
@@ -80,40 +90,30 @@ impl Dataset {
 }
 
 /// Returns the first format that a folder has; fails if it has none.
-fn recognise_format(folder: &Path) -> Result<Format, DatasetError> {
-    let format = find_format(folder)?.ok_or_else(|| Problem::Unrecognised {
-        path: folder.to_path_buf(),
-        finding: find_nearby(folder),
-    })?;
-    Ok(format)
+fn recognise_format(folder: &Path) -> anyhow::Result<Format> {
+    if let Some(format) = find_format(folder)? {
+        return Ok(format);
+    }
+    let path = path_text(folder);
+    if let Some(finding) = find_nearby(folder) {
+        bail!("{path}: no data set; {finding}");
+    }
+    let expected = expected_files();
+    bail!(DatasetError::Unrecognised(format!("{path}: no data set; expected {expected}")))
 }
 
 /// Returns the first format that a folder has, if any.
-fn find_format(folder: &Path) -> Result<Option<Format>, DatasetError> {
+fn find_format(folder: &Path) -> anyhow::Result<Option<Format>> {
     for format in Format::ALL {
-        if has_format(format, folder)? {
+        let is_found = match format.file() {
+            Some(file) => is_file(&folder.join(file))?,
+            None => !colmap::find_models(folder)?.is_empty(),
+        };
+        if is_found {
             return Ok(Some(format));
         }
     }
     Ok(None)
-}
-
-/// Returns whether a folder has a format.
-fn has_format(format: Format, folder: &Path) -> Result<bool, DatasetError> {
-    match format.file() {
-        Some(file) => is_file(&folder.join(file)),
-        None => Ok(!colmap::find_models(folder)?.is_empty()),
-    }
-}
-
-/// Reads a folder of a format.
-fn read_format(format: Format, folder: &Path) -> Result<Dataset, DatasetError> {
-    match format {
-        Format::Blender => blender::read(folder),
-        Format::Transforms => transforms::read(folder),
-        Format::Llff => llff::read(folder),
-        Format::Colmap => colmap::read(folder),
-    }
 }
 
 #[cfg(test)]
@@ -123,8 +123,8 @@ mod tests {
     #[test]
     fn an_unknown_folder_is_refused_with_the_known_formats() {
         let message = Dataset::read("/nowhere".as_ref()).unwrap_err().to_string();
-        let expected = "/nowhere: no data set; expected transforms_train.json (Blender), ";
+        let expected = "/nowhere: no data set; expected Blender (transforms_train.json), ";
         assert!(message.starts_with(expected), "{message}");
-        assert!(message.contains("sparse/0 (COLMAP)"), "{message}");
+        assert!(message.contains("COLMAP (sparse)"), "{message}");
     }
 }

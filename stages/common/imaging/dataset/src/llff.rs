@@ -1,22 +1,22 @@
 use std::path::{Path, PathBuf};
 
-use artifact::{format_count, format_number};
+use anyhow::{Context as _, ensure};
+use artifact::{format_count, format_number, one_line};
 use glam::{DMat3, DVec3};
 use scene::{Distortion, Intrinsics, pose_of};
 
 use crate::colmap;
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, Reason};
-use crate::file_status::{
-    FileProblem, FileStatus, check_link, file_status, is_file, is_hidden, path_text,
-};
+use crate::error::frame_label;
+use crate::file_status::{check_file, check_link, is_file, path_text, visible_entries};
 use crate::format::Format;
 use crate::frame::{Frame, unique_names};
-use crate::lookup::{Located, Lookup};
+use crate::lookup::Lookup;
 use crate::masks::without_dynamic_masks;
-use crate::npy::{read_matrix, shape_reason};
+use crate::npy::read_matrix;
 use crate::photograph::{ImageHeader, fit_camera, is_image_name, read_header};
 use crate::text::read_text;
+use crate::transforms::side_length;
 use crate::unsupported::unsupported_summary;
 
 /// Numbers per photograph: a 3×5 matrix (axes down, right and back; centre; height, width and focal
@@ -24,7 +24,7 @@ use crate::unsupported::unsupported_summary;
 const NUMBERS: usize = 17;
 
 /// Reads `poses_bounds.npy` (Mildenhall et al. 2019) and the images next to it, sorted by name.
-pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
+pub(crate) fn read(folder: &Path) -> anyhow::Result<Dataset> {
     let path = folder.join("poses_bounds.npy");
     let rows = read_numbers(&path)?;
     check_link(&folder.join("images"))?;
@@ -35,7 +35,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     for (index, image) in images.into_iter().enumerate() {
         let name = &names[index];
         let frame = read_frame(&rows[index], distortion, name, image)
-            .map_err(|reason| DatasetError::frame(&path, index, name, reason))?;
+            .with_context(|| frame_label(&path, index, name))?;
         frames.push(frame);
     }
     notes.extend(note);
@@ -58,7 +58,7 @@ fn colmap_distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Opt
             return without(format!("the model in sparse has {} cameras", cameras.len()));
         }
         Ok(cameras) => cameras[0],
-        Err(e) => return without(e.to_string()),
+        Err(e) => return without(one_line(&e)),
     };
     if rows.iter().all(|row| has_focal_length_of(&camera, row)) {
         (camera.distortion, None)
@@ -83,7 +83,7 @@ fn read_frame(
     distortion: Distortion,
     name: &str,
     image: PathBuf,
-) -> Result<Frame, Reason> {
+) -> anyhow::Result<Frame> {
     let stored: ImageHeader = read_header(&image)?;
     let [down, right, back, centre, size_and_focal] =
         [0, 1, 2, 3, 4].map(|c| DVec3::new(row[c], row[5 + c], row[10 + c]));
@@ -93,29 +93,20 @@ fn read_frame(
     let intrinsics = Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion };
     let fitted = fit_camera(intrinsics, stored)?;
     let (near, far) = (row[15], row[16]);
-    if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
-        return Err(Reason::new(format!(
-            "bounds {} and {}, expected 0 < near < far; LLFF's imgs2poses confuses views if COLMAP \
-            registered them in another order than that of their names: rerun COLMAP on images \
-            sorted by name, or use COLMAP's model without poses_bounds.npy",
-            format_number(near),
-            format_number(far)
-        )));
-    }
+    ensure!(
+        near.is_finite() && far.is_finite() && 0.0 < near && near < far,
+        "bounds {} and {}, expected 0 < near < far; LLFF's imgs2poses confuses views if COLMAP \
+        registered them in another order than that of their names: rerun COLMAP on images sorted \
+        by name, or use COLMAP's model without poses_bounds.npy",
+        format_number(near),
+        format_number(far)
+    );
     let camera_to_world = pose_of(DMat3::from_cols(right, -down, back), centre);
     let mut frame = Frame::new(image, fitted, camera_to_world);
     frame.name = name.to_owned();
     frame.depth_range = Some([near, far]);
     frame.check()?;
     Ok(frame)
-}
-
-fn side_length(value: f64, name: &str) -> Result<u32, Reason> {
-    if (1.0..=f64::from(u32::MAX)).contains(&value) {
-        Ok(value.round() as u32)
-    } else {
-        Err(Reason::invalid_side(name, value))
-    }
 }
 
 /// Photographs in the order of the poses.
@@ -134,79 +125,54 @@ impl Photographs {
     }
 }
 
-/// Folder with images, for a message.
-struct ImageFolder {
-    name: String,
-    /// Number of images.
-    images: usize,
-    /// First entry that is named like an image but can't be read.
-    unusable: Option<FileProblem>,
-    /// Number and format of images in an unsupported format, with the remedy.
-    unsupported: Option<String>,
-}
-
-/// Lists the folders with their numbers of images.
-fn folders_text(folders: &[ImageFolder]) -> String {
-    if folders.is_empty() {
-        return "and no folder images/ next to this file; put the photographs there".to_owned();
-    }
-    let mut listed = Vec::new();
-    for ImageFolder { name, images, unusable, unsupported } in folders {
-        let remark = unusable.as_ref().map(ToString::to_string).or_else(|| unsupported.clone());
-        let remark = remark.map(|remark| format!(" ({remark})")).unwrap_or_default();
-        listed.push(format!("{} in {name}/{remark}", format_count(*images, "image")));
-    }
-    format!(
-        "for {}; counts must match, or view_imgs.txt must list the images that have poses",
-        listed.join(" and ")
-    )
-}
-
 /// Finds the folder with one image per pose: `images`, or the first of `images_2`, `images_3` and
 /// so on, up to 64, chosen by hand. Without such a folder, a list may name the images that have
 /// poses.
-fn find_photographs(folder: &Path, path: &Path, poses: usize) -> Result<Photographs, DatasetError> {
+fn find_photographs(folder: &Path, path: &Path, poses: usize) -> anyhow::Result<Photographs> {
     let mut names = vec!["images".to_owned()];
     names.extend((2..=64).map(|n| format!("images_{n}")));
-    let mut folders = Vec::new();
+    names.retain(|name| folder.join(name).is_dir());
+    let mut found = Vec::new();
     for name in names {
-        let Some((files, image_folder)) = list_images(folder, &name) else { continue };
+        let (files, remark) = list_images(&folder.join(&name));
         if files.len() == poses {
             let relative = files.iter().filter_map(|p| p.strip_prefix(folder).ok());
             let labels = relative.map(Path::to_path_buf).collect();
             return Ok(Photographs::new(files, labels, &name));
         }
-        folders.push(image_folder);
+        found.push(format!("{} in {name}/{remark}", format_count(files.len(), "image")));
     }
-    match find_listed_photographs(folder, path, poses)? {
-        Some(found) => Ok(found),
-        None => {
-            let reason = Reason::new(format!("{poses} poses {}", folders_text(&folders)));
-            Err(DatasetError::format(path, reason))
+    find_listed_photographs(folder, path, poses)?.with_context(|| {
+        let path = path_text(path);
+        if found.is_empty() {
+            return format!(
+                "{path}: {poses} poses and no folder images/ next to this file; put the \
+                photographs there"
+            );
         }
-    }
+        format!(
+            "{path}: {poses} poses for {}; counts must match, or view_imgs.txt must list the \
+            images that have poses",
+            found.join(" and ")
+        )
+    })
 }
 
-/// Lists a folder's images by name, and describes the folder for an error. Hidden files and
-/// instant-ngp's masks are not images.
-fn list_images(folder: &Path, name: &str) -> Option<(Vec<PathBuf>, ImageFolder)> {
-    let path = folder.join(name);
-    let entries = std::fs::read_dir(&path).ok()?.flatten().map(|entry| entry.path());
-    let mut files: Vec<PathBuf> = entries.filter(|path| !is_hidden(path)).collect();
-    files.sort();
-    let unsupported = unsupported_summary(&files);
-    files.retain(|path| is_image_name(path));
-    let mut files = without_dynamic_masks(files);
-    let mut unusable = None;
-    files.retain(|path| match file_status(path, "an image") {
-        FileStatus::File => true,
-        FileStatus::Missing(problem) | FileStatus::Unusable(problem) => {
-            unusable.get_or_insert(problem);
-            false
+/// Lists a folder's images by name, with a remark for an error on files that can't be read. Hidden
+/// files and instant-ngp's masks are not images.
+fn list_images(folder: &Path) -> (Vec<PathBuf>, String) {
+    let entries = visible_entries(folder);
+    let unsupported = unsupported_summary(&entries);
+    let images = entries.into_iter().filter(|path| is_image_name(path)).collect();
+    let (mut files, mut problem) = (Vec::new(), None);
+    for path in without_dynamic_masks(images) {
+        match check_file(&path, "an image") {
+            Ok(()) => files.push(path),
+            Err(found) => problem = problem.or(Some(found.to_string())),
         }
-    });
-    let images = files.len();
-    Some((files, ImageFolder { name: name.to_owned(), images, unusable, unsupported }))
+    }
+    let remark = problem.or(unsupported).map(|remark| format!(" ({remark})"));
+    (files, remark.unwrap_or_default())
 }
 
 /// Finds the images listed by `view_imgs.txt` (imgs2poses) or by COLMAP's model next to the poses,
@@ -215,7 +181,7 @@ fn find_listed_photographs(
     folder: &Path,
     path: &Path,
     poses: usize,
-) -> Result<Option<Photographs>, DatasetError> {
+) -> anyhow::Result<Option<Photographs>> {
     let list = folder.join("view_imgs.txt");
     let mut lists = Vec::new();
     if is_file(&list)? {
@@ -234,17 +200,9 @@ fn find_listed_photographs(
     let mut lookup = Lookup::in_images(folder, &names);
     let (mut images, mut labels) = (Vec::new(), Vec::new());
     for (index, name) in names.iter().enumerate() {
-        let frame_error = |reason| DatasetError::frame(path, index, name, reason);
-        match lookup.find(name).map_err(|e| frame_error(e.into()))? {
-            Located::File(file) => {
-                images.push(folder.join(&file.path));
-                labels.push(file.label);
-            }
-            Located::Missing(problem) | Located::Unusable(problem) => {
-                let remedy = "restore the photograph";
-                return Err(frame_error(Reason::unusable(&problem, remedy)));
-            }
-        }
+        let file = lookup.find(name).with_context(|| frame_label(path, index, name))?;
+        images.push(folder.join(&file.path));
+        labels.push(file.label);
     }
     let from = lookup.base().strip_prefix(folder).map(path_text).unwrap_or_default();
     let mut found = Photographs::new(images, labels, &from);
@@ -254,18 +212,18 @@ fn find_listed_photographs(
 }
 
 /// Reads the array's rows.
-fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
-    let bytes = std::fs::read(path).map_err(|source| DatasetError::io(path, source))?;
-    let matrix = read_matrix(&bytes).map_err(|reason| array_error(path, &reason))?;
-    if matrix.columns != NUMBERS || matrix.numbers.is_empty() {
-        return Err(array_error(path, &shape_reason(&[matrix.rows, matrix.columns])));
-    }
+fn read_numbers(path: &Path) -> anyhow::Result<Vec<[f64; NUMBERS]>> {
+    let bytes = std::fs::read(path).with_context(|| path_text(path))?;
+    let array_error = || format!("{}: not a NumPy array of N×{NUMBERS} numbers", path_text(path));
+    let matrix = read_matrix(&bytes).with_context(array_error)?;
+    ensure!(
+        matrix.columns == NUMBERS && !matrix.numbers.is_empty(),
+        "{}: unsupported shape [{}, {}]",
+        array_error(),
+        matrix.rows,
+        matrix.columns
+    );
     Ok(matrix.numbers.as_chunks().0.to_vec())
-}
-
-fn array_error(path: &Path, reason: &Reason) -> DatasetError {
-    let reason = format!("not a NumPy array of N×{NUMBERS} numbers: {reason}");
-    DatasetError::format(path, Reason::new(reason))
 }
 
 #[cfg(test)]

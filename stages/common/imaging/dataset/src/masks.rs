@@ -3,10 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use anyhow::Context as _;
 use artifact::{WARNING, format_count};
 
 use crate::dataset::Dataset;
-use crate::error::DatasetError;
 use crate::file_status::path_text;
 use crate::frame::{Frame, Turn};
 use crate::lookup::{Listings, LookupError};
@@ -59,13 +59,13 @@ const MASKS: &str = "masks";
 const DYNAMIC_PREFIX: &str = "dynamic_mask_";
 
 /// Finds the masks of frames that don't name one, and adds notes on all masks.
-pub(crate) fn add_masks(folder: &Path, set: &mut Dataset) -> Result<(), DatasetError> {
+pub(crate) fn add_masks(folder: &Path, set: &mut Dataset) -> anyhow::Result<()> {
     let mut listings = Listings::new(folder);
     let may_have_masks_folder = set.format.has_masks_folder();
     for frame in set.frames.iter_mut().filter(|frame| frame.mask.is_none()) {
         let Ok(image) = frame.image.strip_prefix(folder) else { continue };
-        let found = find_mask(&mut listings, image, may_have_masks_folder);
-        let found = found.map_err(|reason| DatasetError::format(&frame.image, reason))?;
+        let found = find_mask(&mut listings, image, may_have_masks_folder)
+            .with_context(|| path_text(&frame.image))?;
         frame.mask = found.map(|(path, kind)| MaskFile { path: folder.join(path), kind });
     }
     set.notes.extend(usage_note(&set.frames));
@@ -161,7 +161,7 @@ fn usage_note(frames: &[Frame]) -> Option<String> {
 
 /// Returns a note on masks that differ from their photographs in size, and a warning about those
 /// that differ in aspect ratio.
-fn size_notes(folder: &Path, frames: &[Frame]) -> Result<Vec<String>, DatasetError> {
+fn size_notes(folder: &Path, frames: &[Frame]) -> anyhow::Result<Vec<String>> {
     let (mut resized, mut distorted) = (Vec::new(), Vec::new());
     for frame in frames {
         let Some(mask) = &frame.mask else { continue };

@@ -37,13 +37,10 @@ pub(crate) fn find_nearby(folder: &Path) -> Option<String> {
         .or_else(|| find_packed(folder))
 }
 
-/// Describes data sets in other folders; `None` if there are none.
-fn sets_text(sets: &[(PathBuf, Format)]) -> Option<String> {
-    let listed = sets.iter().take(MAX_LISTED);
-    let listed: Vec<String> = listed
-        .map(|(folder, format)| format!("{} in {}", format.title(), path_text(folder)))
-        .collect();
-    let more = sets.len().saturating_sub(MAX_LISTED);
+/// Lists data sets, with the remedy; `None` if there are none.
+fn sets_text(sets: &[String]) -> Option<String> {
+    let listed = &sets[..sets.len().min(MAX_LISTED)];
+    let more = sets.len() - listed.len();
     let more = if more > 0 { format!(" and {more} more") } else { String::new() };
     let choice = if sets.len() == 1 { "that folder" } else { "one of these folders" };
     (!sets.is_empty()).then(|| format!("found {}{more}; give {choice}", listed.join(", ")))
@@ -120,14 +117,15 @@ fn find_above(folder: &Path) -> Option<String> {
     sets_text(&sets)
 }
 
-fn sets_of(folders: &[PathBuf]) -> Vec<(PathBuf, Format)> {
+/// Describes the folders that are data sets.
+fn sets_of(folders: &[PathBuf]) -> Vec<String> {
     let mut sets = Vec::new();
     for folder in folders {
         // Folders that can't be read, and models without their images, are not suggested.
         if let Ok(Some(format)) = find_format(folder)
             && (format != Format::Colmap || colmap::has_photographs(folder))
         {
-            sets.push((folder.clone(), format));
+            sets.push(format!("{} in {}", format.title(), path_text(folder)));
         }
     }
     sets

@@ -1,6 +1,6 @@
 //! Reads matrices in NumPy's format, versions 1 to 3.
 
-use crate::error::Reason;
+use anyhow::{Context as _, bail, ensure};
 
 /// Maximum length of a header: NumPy's default limit. The header of a matrix has about 100 bytes.
 const MAX_HEADER_BYTES: usize = 10_000;
@@ -14,47 +14,39 @@ pub(crate) struct Matrix {
 }
 
 /// Reads a matrix of floats from a file's bytes.
-pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, Reason> {
-    let preamble = "magic string or version is wrong, or the header is incomplete";
-    let (header, data) = split_header(bytes).ok_or_else(|| Reason::new(preamble))?;
-    if header.len() > MAX_HEADER_BYTES {
-        let length = header.len();
-        let problem = format!("header has {length} bytes; the maximum is {MAX_HEADER_BYTES}");
-        return Err(Reason::new(problem));
-    }
-    let missing = |entry: &str| Reason::new(format!("header has no {entry}"));
+pub(crate) fn read_matrix(bytes: &[u8]) -> anyhow::Result<Matrix> {
+    let (header, data) = split_header(bytes)
+        .context("magic string or version is wrong, or the header is incomplete")?;
+    let length = header.len();
+    ensure!(
+        length <= MAX_HEADER_BYTES,
+        "header has {length} bytes; the maximum is {MAX_HEADER_BYTES}"
+    );
     let element_type = entry(header, "descr")
         .and_then(parse_string)
-        .ok_or_else(|| missing("descr that is a string"))?;
+        .context("header has no descr that is a string")?;
     let is_by_columns = entry(header, "fortran_order")
         .and_then(parse_bool)
-        .ok_or_else(|| missing("fortran_order that is True or False"))?;
+        .context("header has no fortran_order that is True or False")?;
     let shape =
-        entry(header, "shape").and_then(parse_shape).ok_or_else(|| missing("shape of integers"))?;
-    let [rows, columns] = shape[..] else { return Err(shape_reason(&shape)) };
-    let count = rows.checked_mul(columns).ok_or_else(|| shape_reason(&shape))?;
+        entry(header, "shape").and_then(parse_shape).context("header has no shape of integers")?;
+    let [rows, columns] = shape[..] else { bail!("unsupported shape {shape:?}") };
+    let count =
+        rows.checked_mul(columns).with_context(|| format!("unsupported shape {shape:?}"))?;
     let stored = match element_type {
         "<f8" | "=f8" => numbers(data, count, f64::from_le_bytes),
         ">f8" => numbers(data, count, f64::from_be_bytes),
         "<f4" | "=f4" => numbers(data, count, |bytes| f64::from(f32::from_le_bytes(bytes))),
         ">f4" => numbers(data, count, |bytes| f64::from(f32::from_be_bytes(bytes))),
-        _ => {
-            let problem = format!("element type is {element_type:?}, not a float");
-            return Err(Reason::new(problem));
-        }
+        _ => bail!("element type is {element_type:?}, not a float"),
     };
-    let stored = stored.ok_or_else(|| Reason::new("file is cut short"))?;
+    let stored = stored.context("file is cut short")?;
     let numbers = if is_by_columns {
         (0..count).map(|i| stored[i % columns * rows + i / columns]).collect()
     } else {
         stored
     };
     Ok(Matrix { rows, columns, numbers })
-}
-
-/// Returns the reason why an array's shape isn't that of the expected matrix.
-pub(crate) fn shape_reason(shape: &[usize]) -> Reason {
-    Reason::new(format!("unsupported shape {shape:?}"))
 }
 
 /// Splits a file into the header's text and the data after it.
@@ -117,8 +109,8 @@ mod tests {
         [b"\x93NUMPY", &[version, 0][..], length, header.as_bytes(), data].concat()
     }
 
-    fn matrix(numbers: [f64; 6]) -> Result<Matrix, Reason> {
-        Ok(Matrix { rows: 2, columns: 3, numbers: numbers.to_vec() })
+    fn matrix(numbers: [f64; 6]) -> Matrix {
+        Matrix { rows: 2, columns: 3, numbers: numbers.to_vec() }
     }
 
     fn padded_header(kind: &str, order: &str) -> String {
@@ -134,14 +126,14 @@ mod tests {
         for version in [1, 2, 3] {
             for (kind, bytes) in [("<f8", &little), (">f8", &big), ("<f4", &single)] {
                 let bytes = file(version, &padded_header(kind, "False"), bytes);
-                assert_eq!(read_matrix(&bytes), matrix(data), "{version} {kind}");
+                assert_eq!(read_matrix(&bytes).unwrap(), matrix(data), "{version} {kind}");
             }
         }
         // Column-major order.
         let bytes = file(1, &padded_header("<f8", "True"), &little);
-        assert_eq!(read_matrix(&bytes), matrix([1.5, 3.0, 5.0, 2.0, 4.0, -6.5]));
+        assert_eq!(read_matrix(&bytes).unwrap(), matrix([1.5, 3.0, 5.0, 2.0, 4.0, -6.5]));
         let python_2 = r#"{"descr": "<f8", "fortran_order": False, "shape": (2L, 3L)}"#;
-        assert_eq!(read_matrix(&file(1, python_2, &little)), matrix(data));
+        assert_eq!(read_matrix(&file(1, python_2, &little)).unwrap(), matrix(data));
     }
 
     fn header(kind: &str, shape: &str) -> String {

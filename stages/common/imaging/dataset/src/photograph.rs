@@ -2,6 +2,7 @@ use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
+use anyhow::bail;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use pixels::{
@@ -10,7 +11,6 @@ use pixels::{
 };
 use scene::{Intrinsics, undistort_image};
 
-use crate::error::{DatasetError, Reason};
 use crate::frame::{Frame, Turn};
 use crate::jpeg::{Completeness, END_MARKER, check_completeness};
 use crate::unsupported::unsupported_error;
@@ -20,13 +20,16 @@ pub(crate) const IMAGE_EXTENSIONS: [&str; 4] = [".png", ".jpg", ".jpeg", ".exr"]
 
 /// True if a file's name is that of a supported image.
 pub fn is_image_name(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| {
-        IMAGE_EXTENSIONS.iter().any(|known| extension.eq_ignore_ascii_case(&known[1..]))
-    })
+    IMAGE_EXTENSIONS.iter().any(|known| has_extension(path, &known[1..]))
 }
 
 pub(crate) fn is_exr(path: &Path) -> bool {
-    path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
+    has_extension(path, "exr")
+}
+
+/// True if a file's name has an extension, in any case.
+pub(crate) fn has_extension(path: &Path, extension: &str) -> bool {
+    path.extension().is_some_and(|found| found.eq_ignore_ascii_case(extension))
 }
 
 /// Creates the decoder of a PNG or JPEG, recognised by content rather than by name.
@@ -100,7 +103,7 @@ pub(crate) fn read_header(path: &Path) -> Result<ImageHeader, PixelError> {
 
 /// Resizes a camera to an image, as stored or as turned by EXIF. Returns the resized intrinsics and
 /// the treatment of the EXIF orientation. Fails if the aspect ratios differ.
-pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> Result<(Intrinsics, Turn), Reason> {
+pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> anyhow::Result<(Intrinsics, Turn)> {
     let (width, height) = stored.size;
     let is_turned_fit = stored.is_sideways() && has_aspect_of(&k, height, width);
     let is_turned_exactly = stored.is_sideways() && (k.height, k.width) == stored.size;
@@ -114,10 +117,11 @@ pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> Result<(Intrinsi
     } else if is_turned_fit {
         Ok((k.resized(height, width), Turn::Upright))
     } else {
-        Err(Reason::new(format!(
+        bail!(
             "the image has {width}×{height} pixels, its camera {}×{}; aspect ratios must match",
-            k.width, k.height
-        )))
+            k.width,
+            k.height
+        )
     }
 }
 
@@ -139,35 +143,31 @@ fn read_image(path: &Path, turn_upright: bool) -> Result<(Rgba8, Clipping), Pixe
         return read_exr_photograph(path);
     }
     let mut bytes = fs::read(path).map_err(PixelError::io(path))?;
-    let mut is_header_readable = true;
     if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
-        is_header_readable =
-            complete_jpeg(&mut bytes).map_err(|reason| PixelError::format(path, reason))?;
+        complete_jpeg(&mut bytes).map_err(|reason| PixelError::format(path, reason))?;
     }
     let mut decoder = decoder(Cursor::new(bytes), path)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
         .map_err(|e| PixelError::format(path, format!("incomplete or damaged image ({e})")))?;
-    if !is_header_readable {
-        return Err(PixelError::format(path, "damaged JPEG: headers and image data don't match"));
-    }
     if turn_upright {
         image.apply_orientation(orientation);
     }
     Ok((image.into(), Clipping::default()))
 }
 
-/// Fails if rows or scans of a JPEG are missing, which its decoder would replace by grey. Adds a
-/// missing end marker, without which the decoder omits the last rows. Returns false if the headers
-/// are unreadable.
-fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<bool, String> {
+/// Fails if headers of a JPEG are unreadable, or rows or scans are missing, which its decoder would
+/// replace by grey. Adds a missing end marker, without which the decoder omits the last rows.
+fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<(), String> {
     match check_completeness(jpeg) {
-        Completeness::Complete => Ok(true),
-        Completeness::UnreadableHeader => Ok(false),
+        Completeness::Complete => Ok(()),
+        Completeness::UnreadableHeader => {
+            Err("damaged JPEG: headers and image data don't match".to_owned())
+        }
         Completeness::Unterminated { end } => {
             jpeg.truncate(end);
             jpeg.extend(END_MARKER);
-            Ok(true)
+            Ok(())
         }
         Completeness::Missing { rows, height } => {
             Err(format!("cut short or damaged: {rows} of {height} rows are missing"))
@@ -242,33 +242,29 @@ const RGBA_BYTES: u64 = 4;
 /// 2 bytes each. Also counted for other JPEGs and for PNG, as an upper bound.
 const COEFFICIENT_BYTES: u64 = 6;
 
-/// Returns the peak memory in bytes while an image is read, estimated from the image's header.
-fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
-    if is_exr(path) {
-        let (width, height) = exr_size(path)?;
-        return Ok(exr_reading_bytes(path)? + RGBA_BYTES * (width * height) as u64);
-    }
-    let file = File::open(path).map_err(PixelError::io(path))?;
-    let decoder = decoder(BufReader::new(file), path)?;
-    let (width, height) = decoder.dimensions();
-    let pixels = u64::from(width) * u64::from(height);
-    Ok(decoder.total_bytes() + (RGBA_BYTES + COEFFICIENT_BYTES) * pixels)
-}
-
 impl Frame {
     /// Returns the peak memory in bytes during [`Frame::photograph`], estimated from the image's
     /// header.
-    pub fn reading_bytes(&self) -> Result<u64, DatasetError> {
-        Ok(reading_bytes(&self.image)?)
+    pub fn reading_bytes(&self) -> Result<u64, PixelError> {
+        let path = &self.image;
+        if is_exr(path) {
+            let (width, height) = exr_size(path)?;
+            return Ok(exr_reading_bytes(path)? + RGBA_BYTES * (width * height) as u64);
+        }
+        let file = File::open(path).map_err(PixelError::io(path))?;
+        let decoder = decoder(BufReader::new(file), path)?;
+        let (width, height) = decoder.dimensions();
+        let pixels = u64::from(width) * u64::from(height);
+        Ok(decoder.total_bytes() + (RGBA_BYTES + COEFFICIENT_BYTES) * pixels)
     }
 
     /// Reads the image of [`Frame::camera`], as taken or with its distortion removed.
-    pub fn photograph(&self) -> Result<Rgba8, DatasetError> {
+    pub fn photograph(&self) -> Result<Rgba8, PixelError> {
         Ok(self.photograph_and_clipping()?.0)
     }
 
     /// Reads [`Frame::photograph`], and counts its pixels brighter than 1.
-    pub fn photograph_and_clipping(&self) -> Result<(Rgba8, Clipping), DatasetError> {
+    pub fn photograph_and_clipping(&self) -> Result<(Rgba8, Clipping), PixelError> {
         let (image, clipping) = read_image(&self.image, self.turn == Turn::Upright)?;
         let k = self.lens_intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
@@ -276,7 +272,7 @@ impl Frame {
                 "image is {}×{} pixels, its camera {}×{}",
                 image.width, image.height, k.width, k.height
             );
-            return Err(PixelError::format(&self.image, reason).into());
+            return Err(PixelError::format(&self.image, reason));
         }
         Ok((self.without_distortion(image), clipping))
     }
@@ -285,7 +281,7 @@ impl Frame {
     /// ray. `None` if there is no mask file and every pixel has a ray. A mask file of a different
     /// size is resampled by nearest neighbour. In a file without bright pixels, all pixels that
     /// aren't black count as bright.
-    pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
+    pub fn mask(&self) -> Result<Option<Mask>, PixelError> {
         let lens = self.intrinsics().lens_mask();
         let Some(file) = &self.mask else { return Ok(lens) };
         let (mut image, _) = read_image(&file.path, self.turn == Turn::Upright)?;

@@ -1,10 +1,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
+use anyhow::{Context as _, ensure};
 use artifact::{format_count, relative_path};
 
-use crate::error::Reason;
-use crate::lookup::{Located, Lookup, LookupError};
+use crate::entry::Entry;
+use crate::lookup::{Lookup, LookupError};
 
 /// Interval of held-out frames, as in LLFF's code.
 const HOLD_OUT_EVERY: usize = 8;
@@ -34,12 +35,7 @@ impl Split {
 }
 
 /// nerfstudio's lists of file names. An empty list counts as absent.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct SplitLists<'a> {
-    pub(crate) train: &'a [String],
-    pub(crate) test: &'a [String],
-    pub(crate) val: &'a [String],
-}
+pub(crate) struct SplitLists([(&'static str, Vec<String>); 3]);
 
 /// Frames by the names and files that split lists may contain.
 #[derive(Debug, Default)]
@@ -56,21 +52,39 @@ impl FrameNames {
         }
     }
 
-    fn find(&self, name: &str, lookup: &mut Lookup) -> Result<&[usize], Reason> {
+    fn find(&self, name: &str, lookup: &mut Lookup) -> Result<&[usize], LookupError> {
         let literal = relative_path(name).unwrap_or_else(|_| PathBuf::from(name));
         if let Some(frames) = self.by_name.get(&literal) {
             return Ok(frames);
         }
         let frames = match lookup.find_repeated(name) {
-            Ok(Located::File(file)) => self.by_name.get(&file.path),
-            Err(ambiguous @ LookupError::Ambiguous { .. }) => return Err(ambiguous.into()),
-            _ => None,
+            Ok(file) => self.by_name.get(&file.path),
+            Err(ambiguous @ LookupError::Ambiguous { .. }) => return Err(ambiguous),
+            Err(_) => None,
         };
         Ok(frames.map(Vec::as_slice).unwrap_or_default())
     }
 }
 
-impl SplitLists<'_> {
+impl SplitLists {
+    /// Reads the lists of training, test and validation views.
+    pub(crate) fn read(entry: &Entry) -> anyhow::Result<Self> {
+        let mut lists =
+            ["train_filenames", "test_filenames", "val_filenames"].map(|key| (key, Vec::new()));
+        for (key, names) in &mut lists {
+            for name in entry.list(key)? {
+                let name = name.as_str().with_context(|| format!("{key}: {name} is not text"))?;
+                names.push(name.to_owned());
+            }
+        }
+        Ok(Self(lists))
+    }
+
+    /// Returns the names in all lists.
+    pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
+        self.0.iter().flat_map(|(_, names)| names).map(String::as_str)
+    }
+
     /// Returns the split of `count` frames that the lists describe, with notes. Validation views
     /// are test views if there are no others. If only one side is listed, unlisted frames are on
     /// the other side.
@@ -79,11 +93,11 @@ impl SplitLists<'_> {
         count: usize,
         names: &FrameNames,
         lookup: &mut Lookup,
-    ) -> Result<(Option<Split>, Vec<String>), Reason> {
+    ) -> anyhow::Result<(Option<Split>, Vec<String>)> {
         let mut notes = Vec::new();
-        let train = listed_frames("train_filenames", self.train, names, lookup, &mut notes)?;
-        let test = listed_frames("test_filenames", self.test, names, lookup, &mut notes)?;
-        let val = listed_frames("val_filenames", self.val, names, lookup, &mut notes)?;
+        let [train, test, val] =
+            self.0.each_ref().map(|list| listed_frames(list, names, lookup, &mut notes));
+        let (train, test, val) = (train?, test?, val?);
         let listed: BTreeSet<usize> = train.iter().chain(&test).chain(&val).copied().collect();
         let unlisted: BTreeSet<usize> = (0..count).filter(|i| !listed.contains(i)).collect();
         let mut split = [train, if test.is_empty() { val } else { test }];
@@ -114,12 +128,11 @@ impl SplitLists<'_> {
 /// Returns the frames of a list. Names without a frame are noted; a list of only such names is an
 /// error.
 fn listed_frames(
-    list: &str,
-    list_names: &[String],
+    (list, list_names): &(&str, Vec<String>),
     names: &FrameNames,
     lookup: &mut Lookup,
     notes: &mut Vec<String>,
-) -> Result<BTreeSet<usize>, Reason> {
+) -> anyhow::Result<BTreeSet<usize>> {
     let (mut found, mut unknown) = (BTreeSet::new(), Vec::new());
     for name in list_names {
         let frames = names.find(name, lookup)?;
@@ -129,19 +142,15 @@ fn listed_frames(
         }
     }
     if let Some(first) = unknown.first() {
-        if found.is_empty() {
-            let count = unknown.len();
-            return Err(Reason::new(format!(
-                "no name in {list} is that of a frame (first of {count}: {first}); correct the \
-                names, or remove {list}"
-            )));
-        }
+        let count = unknown.len();
+        ensure!(
+            !found.is_empty(),
+            "no name in {list} is that of a frame (first of {count}: {first}); correct the names, \
+            or remove {list}"
+        );
         let names = format_count(list_names.len(), "name");
-        let have = if unknown.len() == 1 { "has" } else { "have" };
-        notes.push(format!(
-            "{} of {names} in {list} {have} no frame (first: {first})",
-            unknown.len()
-        ));
+        let have = if count == 1 { "has" } else { "have" };
+        notes.push(format!("{count} of {names} in {list} {have} no frame (first: {first})"));
     }
     Ok(found)
 }

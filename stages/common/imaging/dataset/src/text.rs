@@ -1,8 +1,9 @@
 use std::path::Path;
 
+use anyhow::{Context as _, anyhow, ensure};
 use artifact::{format_count, shortened};
 
-use crate::error::{DatasetError, Reason};
+use crate::file_status::path_text;
 
 /// Formats a count with its noun and verb, such as `1 mask has` or `2 masks have`.
 pub(crate) fn counted_with_verb(count: usize, noun: &str, [one, many]: [&str; 2]) -> String {
@@ -10,18 +11,16 @@ pub(crate) fn counted_with_verb(count: usize, noun: &str, [one, many]: [&str; 2]
 }
 
 /// Reads a text file in UTF-8, with or without a byte order mark.
-pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {
-    let bytes = std::fs::read(path).map_err(|source| DatasetError::io(path, source))?;
-    decode(bytes).map_err(|reason| DatasetError::format(path, reason))
+pub(crate) fn read_text(path: &Path) -> anyhow::Result<String> {
+    let bytes = std::fs::read(path).with_context(|| path_text(path))?;
+    decode(bytes).with_context(|| path_text(path))
 }
 
 const UTF8_MARK: &[u8] = b"\xef\xbb\xbf";
 
 /// Decodes a file's text; fails with the encoding or the first word that isn't UTF-8.
-fn decode(mut bytes: Vec<u8>) -> Result<String, Reason> {
-    if is_utf16(&bytes) {
-        return Err(Reason::new("file is UTF-16; save it as UTF-8"));
-    }
+fn decode(mut bytes: Vec<u8>) -> anyhow::Result<String> {
+    ensure!(!is_utf16(&bytes), "file is UTF-16; save it as UTF-8");
     if bytes.starts_with(UTF8_MARK) {
         bytes.drain(..UTF8_MARK.len());
     }
@@ -37,7 +36,7 @@ fn decode(mut bytes: Vec<u8>) -> Result<String, Reason> {
         let word = bytes[start..end].escape_ascii().to_string();
         let word = shortened(&word);
         let remedy = "save the file as UTF-8, and rename files with such names";
-        Reason::new(format!("line {line}: {word} is not UTF-8; {remedy}"))
+        anyhow!("line {line}: {word} is not UTF-8; {remedy}")
     })
 }
 

@@ -1,45 +1,41 @@
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context as _, bail, ensure};
 use artifact::{format_count, format_number};
 use scene::{CameraError, Intrinsics};
-use serde::Deserialize;
 use serde_json::Value;
 
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, Reason};
+use crate::entry::{Entry, parse_number};
+use crate::file_status::path_text;
 use crate::format::Format;
 use crate::frame::{Frame, Turn};
 use crate::frame_file::{FrameFile, MissingImages, lookup_of};
-use crate::lens_entry::LensEntry;
-use crate::number::Number;
+use crate::lens_entry::distortion;
 use crate::photograph::{ImageHeader, fit_camera, read_header};
 
-/// Content of `transforms.json`; `shared` contains defaults for all frames, which are parsed one by
-/// one.
-#[derive(Deserialize)]
-pub(crate) struct Transforms {
-    #[serde(flatten)]
-    pub(crate) shared: LensEntry,
-    pub(crate) frames: Vec<Value>,
-    /// File names of nerfstudio's split.
-    pub(crate) train_filenames: Option<Vec<String>>,
-    pub(crate) test_filenames: Option<Vec<String>>,
-    pub(crate) val_filenames: Option<Vec<String>>,
-}
-
-#[derive(Deserialize)]
+/// Frame of `transforms.json`, with the file's shared values.
 pub(crate) struct FrameEntry {
     pub(crate) file_path: String,
     pub(crate) mask_path: Option<String>,
     pub(crate) depth_file_path: Option<String>,
-    /// Pose, row by row.
-    transform_matrix: Value,
-    #[serde(flatten)]
-    own: LensEntry,
+    /// All values, of the pose and the lens, too.
+    values: Entry,
+}
+
+impl FrameEntry {
+    /// Reads the names of a frame's files.
+    pub(crate) fn new(values: Entry) -> anyhow::Result<Self> {
+        let [image, mask, depth] = ["file_path", "mask_path", "depth_file_path"]
+            .map(|key| values.text(key).map(|name| name.map(str::to_owned)));
+        let file_path = image?.context("missing field `file_path`")?;
+        ensure!(values.has("transform_matrix"), "missing field `transform_matrix`");
+        Ok(Self { file_path, mask_path: mask?, depth_file_path: depth?, values })
+    }
 }
 
 /// Reads `transforms.json`, the format of instant-ngp and nerfstudio.
-pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
+pub(crate) fn read(folder: &Path) -> anyhow::Result<Dataset> {
     let file = FrameFile::read(&folder.join("transforms.json"))?;
     let mut lookup = lookup_of(folder, &[&file]);
     let read = file.frames(&mut lookup, MissingImages::Skipped)?;
@@ -47,9 +43,9 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
         return Err(file.no_frames());
     }
     let (split, split_notes) = file
-        .split_lists()
+        .split_lists
         .split(read.frames.len(), &read.names, &mut lookup)
-        .map_err(|reason| DatasetError::format(file.path(), reason))?;
+        .with_context(|| path_text(file.path()))?;
     let mut notes = vec![format!(
         "transforms.json (instant-ngp, nerfstudio): {}",
         format_count(read.frames.len(), "photograph")
@@ -62,24 +58,21 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
 }
 
 /// Reads a frame without its name, mask and depth.
-pub(crate) fn read_frame(
-    image: PathBuf,
-    entry: &FrameEntry,
-    shared: &LensEntry,
-) -> Result<Frame, Reason> {
-    let rows = matrix_rows(&entry.transform_matrix);
+pub(crate) fn read_frame(image: PathBuf, entry: &FrameEntry) -> anyhow::Result<Frame> {
+    let rows = entry.values.value("transform_matrix").and_then(matrix_rows);
     let (camera_to_world, last) = match rows.as_deref() {
         Some([x, y, z]) => ([*x, *y, *z], None),
         Some([x, y, z, last]) => ([*x, *y, *z], Some(*last)),
-        _ => return Err(Reason::new("transform_matrix must have 4 rows of 4 numbers")),
+        _ => bail!("transform_matrix must have 4 rows of 4 numbers"),
     };
-    let fitted = intrinsics(&entry.own.or(shared), read_header(&image)?)?;
+    let fitted = intrinsics(&entry.values, read_header(&image)?)?;
     let frame = Frame::new(image, fitted, camera_to_world);
     match frame.check() {
-        Ok(()) => last.map_or(Ok(()), check_last_row).map(|()| frame),
-        Err(CameraError::Intrinsics(problem)) => Err(Reason::new(problem)),
-        Err(CameraError::Pose(problem)) => Err(Reason::new(problem).at("transform_matrix")),
+        Err(CameraError::Pose(problem)) => bail!("transform_matrix: {problem}"),
+        other => other?,
     }
+    last.map_or(Ok(()), check_last_row)?;
+    Ok(frame)
 }
 
 /// Returns a matrix's rows of 4 numbers, written as lists or as one flat list; `None` for anything
@@ -94,8 +87,7 @@ fn matrix_rows(matrix: &Value) -> Option<Vec<[f64; 4]>> {
             return None;
         }
         for value in values {
-            let number = Option::<Number>::deserialize(value).ok()?;
-            numbers.push(number.map_or(f64::NAN, |number| number.0));
+            numbers.push(if value.is_null() { f64::NAN } else { parse_number(value)? });
         }
     }
     let (rows, rest) = numbers.as_chunks::<4>();
@@ -106,70 +98,63 @@ fn matrix_rows(matrix: &Value) -> Option<Vec<[f64; 4]>> {
 const MAX_ROW_ERROR: f64 = 1e-4;
 
 /// Fails if a matrix's last row isn't (0, 0, 0, 1).
-fn check_last_row(row: [f64; 4]) -> Result<(), Reason> {
-    if row
-        .iter()
-        .zip([0.0, 0.0, 0.0, 1.0])
-        .all(|(found, value)| (found - value).abs() <= MAX_ROW_ERROR)
-    {
-        return Ok(());
-    }
-    let row = row.map(format_number).join(" ");
-    let problem = format!("last row is {row}, not 0 0 0 1");
-    let remedy = "is the matrix transposed (column-major)?";
-    Err(Reason::new(problem).with_remedy(remedy).at("transform_matrix"))
+fn check_last_row(row: [f64; 4]) -> anyhow::Result<()> {
+    let expected = [0.0, 0.0, 0.0, 1.0];
+    ensure!(
+        (0..4).all(|i| (row[i] - expected[i]).abs() <= MAX_ROW_ERROR),
+        "transform_matrix: last row is {}, not 0 0 0 1; is the matrix transposed (column-major)?",
+        row.map(format_number).join(" ")
+    );
+    Ok(())
 }
 
 /// Returns an image's intrinsics and the treatment of its EXIF orientation.
-fn intrinsics(entry: &LensEntry, stored: ImageHeader) -> Result<(Intrinsics, Turn), Reason> {
-    let distortion = entry.distortion()?;
+fn intrinsics(entry: &Entry, stored: ImageHeader) -> anyhow::Result<(Intrinsics, Turn)> {
+    let distortion = distortion(entry)?;
     // The size to which the intrinsics refer; the stored image may be a smaller copy.
-    let width = side_length(entry.w, "w", stored.size.0)?;
-    let height = side_length(entry.h, "h", stored.size.1)?;
-    let fx = focal_length(entry.fl_x, entry.camera_angle_x, "camera_angle_x", width)?;
-    let fy = focal_length(entry.fl_y, entry.camera_angle_y, "camera_angle_y", height)?;
+    let width = entry.number("w")?.map_or(Ok(stored.size.0), |w| side_length(w, "w"))?;
+    let height = entry.number("h")?.map_or(Ok(stored.size.1), |h| side_length(h, "h"))?;
+    let fx = focal_length(entry, "fl_x", "camera_angle_x", width)?;
+    let fy = focal_length(entry, "fl_y", "camera_angle_y", height)?;
     let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
-        return Err(Reason::new("no focal length: neither fl_x nor camera_angle_x is given"));
+        bail!("no focal length: neither fl_x nor camera_angle_x is given");
     };
-    let cx = entry.cx.map_or(0.5 * f64::from(width), |cx| cx.0);
-    let cy = entry.cy.map_or(0.5 * f64::from(height), |cy| cy.0);
+    let cx = entry.number("cx")?.unwrap_or(0.5 * f64::from(width));
+    let cy = entry.number("cy")?.unwrap_or(0.5 * f64::from(height));
     let (k, turn) = fit_camera(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)?;
     // Without w and h the camera has the stored shape by assumption, which settles no turn.
-    let is_assumed = turn == Turn::Stored && (entry.w.is_none() || entry.h.is_none());
+    let is_assumed = turn == Turn::Stored && !(entry.has("w") && entry.has("h"));
     Ok((k, if is_assumed { stored.turn_if_both_fit() } else { turn }))
 }
 
-/// Returns a side of the image in pixels; `stored` is the default.
-fn side_length(value: Option<Number>, name: &str, stored: u32) -> Result<u32, Reason> {
-    match value {
-        None => Ok(stored),
-        Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
-        Some(Number(value)) => Err(Reason::invalid_side(name, value)),
-    }
+/// Converts a side of an image to a number of pixels; fails if there is no such image.
+pub(crate) fn side_length(value: f64, name: &str) -> anyhow::Result<u32> {
+    ensure!(
+        (1.0..=f64::from(u32::MAX)).contains(&value),
+        "{name} is {}; an image has 1 to {} pixels per side",
+        format_number(value),
+        u32::MAX
+    );
+    Ok(value.round() as u32)
 }
 
 /// Returns the focal length in pixels, given directly or by the angle of view across `size` pixels.
 fn focal_length(
-    length: Option<Number>,
-    angle: Option<Number>,
-    name: &str,
+    entry: &Entry,
+    length: &str,
+    angle: &str,
     size: u32,
-) -> Result<Option<f64>, Reason> {
-    match (length, angle) {
-        (Some(Number(length)), _) => Ok(Some(length)),
-        (None, Some(Number(angle))) if angle > 0.0 && angle < std::f64::consts::PI => {
-            Ok(Some(0.5 * f64::from(size) / (0.5 * angle).tan()))
-        }
-        (None, Some(Number(angle))) => {
-            let focal = 0.5 / (0.5 * angle).tan();
-            let angle_is_large = angle > std::f64::consts::PI;
-            let [angle, focal] = [angle, focal].map(format_number);
-            let problem = format!("{name} is {angle}: focal length {focal}");
-            let unit = if angle_is_large { " (is it in degrees?)" } else { "" };
-            Err(Reason::new(format!("{problem}; the angle must be between 0 and π{unit}")))
-        }
-        (None, None) => Ok(None),
+) -> anyhow::Result<Option<f64>> {
+    if let Some(length) = entry.number(length)? {
+        return Ok(Some(length));
     }
+    let Some(value) = entry.number(angle)? else { return Ok(None) };
+    ensure!(
+        value > 0.0 && value < std::f64::consts::PI,
+        "{angle} is {}; the angle must be between 0 and π (is it in degrees?)",
+        format_number(value)
+    );
+    Ok(Some(0.5 * f64::from(size) / (0.5 * value).tan()))
 }
 
 #[cfg(test)]
@@ -183,7 +168,7 @@ mod tests {
     const POSE: &str = r#""transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]"#;
 
     /// Reads a data set with the given `transforms.json` and two images.
-    fn read(json: &str) -> Result<Dataset, DatasetError> {
+    fn read(json: &str) -> Result<Dataset, crate::DatasetError> {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("transforms.json"), json).unwrap();
         std::fs::create_dir(dir.path().join("images")).unwrap();
@@ -350,8 +335,9 @@ mod tests {
             (r#""fl_x": 50"#, r#""mask_path": "../a.png","#, "not a path inside"),
             (r#""camera_angle_x": 7"#, "", "between 0 and π (is it in degrees?)"),
             (r#""camera_angle_x": -1"#, "", "between 0 and π"),
-            (r#""fl_x": 50"#, r#""k1": [1],"#, "k1: invalid type: sequence, expected a number"),
-            (r#""fl_x": 50"#, r#""mask_path": 7,"#, "mask_path: invalid type: integer `7`"),
+            (r#""fl_x": 50"#, r#""k1": [1],"#, "k1: expected a number, found [1]"),
+            (r#""fl_x": 50"#, r#""mask_path": 7,"#, "mask_path: expected text, found 7"),
+            (r#""fl_x": "wide""#, "", "fl_x: expected a number, found \"wide\""),
         ] {
             let message = read(&frames(head, first)).unwrap_err().to_string();
             assert!(
@@ -379,7 +365,7 @@ mod tests {
         }
         for (json, expected) in [
             ("", "transforms.json: file is empty"),
-            ("[]", "transforms.json: invalid type: sequence, expected struct"),
+            ("[]", "transforms.json: expected a mapping, found []"),
             (
                 r#"{"frames": [{"file_path": "a.png"}]}"#,
                 "frame 0 (a.png): missing field `transform_matrix`",
@@ -388,8 +374,7 @@ mod tests {
                 r#"{"frames": [{"transform_matrix": []}]}"#,
                 "frame 0 (unnamed): missing field `file_path`",
             ),
-            (r#"{"frames": [1]}"#, "frame 0 (unnamed): invalid type: integer `1`, expected struct"),
-            (r#"{"fl_x": "wide", "frames": []}"#, "transforms.json: fl_x: invalid type: string"),
+            (r#"{"frames": [1]}"#, "frame 0 (unnamed): expected a mapping, found 1"),
         ] {
             let message = read(json).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");

@@ -16,22 +16,22 @@ struct UnsupportedFormat {
     target: &'static str,
 }
 
-const HEIC: UnsupportedFormat = UnsupportedFormat {
-    name: "HEIC",
-    extensions: &["heic", "heif", "hif"],
-    target: "jpg -quality 98",
-};
-const AVIF: UnsupportedFormat =
-    UnsupportedFormat { name: "AVIF", extensions: &["avif"], target: "png" };
-const WEBP: UnsupportedFormat =
-    UnsupportedFormat { name: "WebP", extensions: &["webp"], target: "png" };
-const TIFF: UnsupportedFormat =
-    UnsupportedFormat { name: "TIFF", extensions: &["tif", "tiff"], target: "png" };
-const BMP: UnsupportedFormat =
-    UnsupportedFormat { name: "BMP", extensions: &["bmp"], target: "png" };
-const GIF: UnsupportedFormat =
-    UnsupportedFormat { name: "GIF", extensions: &["gif"], target: "png" };
-const FORMATS: [UnsupportedFormat; 6] = [HEIC, AVIF, WEBP, TIFF, BMP, GIF];
+const FORMATS: [UnsupportedFormat; 6] = [
+    format("HEIC", &["heic", "heif", "hif"], "jpg -quality 98"),
+    format("AVIF", &["avif"], "png"),
+    format("WebP", &["webp"], "png"),
+    format("TIFF", &["tif", "tiff"], "png"),
+    format("BMP", &["bmp"], "png"),
+    format("GIF", &["gif"], "png"),
+];
+
+const fn format(
+    name: &'static str,
+    extensions: &'static [&'static str],
+    target: &'static str,
+) -> UnsupportedFormat {
+    UnsupportedFormat { name, extensions, target }
+}
 
 /// Number of bytes at a file's start that identify its format.
 const SIGNATURE_BYTES: usize = 12;
@@ -43,15 +43,16 @@ impl UnsupportedFormat {
     }
 
     fn from_signature(bytes: &[u8; SIGNATURE_BYTES]) -> Option<Self> {
-        match bytes {
-            [_, _, _, _, b'f', b't', b'y', b'p', b'a', b'v', b'i', _] => Some(AVIF),
-            [_, _, _, _, b'f', b't', b'y', b'p', b'h' | b'm', ..] => Some(HEIC),
-            [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P'] => Some(WEBP),
-            [b'I', b'I', b'*', 0, ..] | [b'M', b'M', 0, b'*', ..] => Some(TIFF),
-            [b'B', b'M', ..] => Some(BMP),
-            [b'G', b'I', b'F', b'8', ..] => Some(GIF),
-            _ => None,
-        }
+        let name = match bytes {
+            [_, _, _, _, b'f', b't', b'y', b'p', b'a', b'v', b'i', _] => "AVIF",
+            [_, _, _, _, b'f', b't', b'y', b'p', b'h' | b'm', ..] => "HEIC",
+            [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P'] => "WebP",
+            [b'I', b'I', b'*', 0, ..] | [b'M', b'M', 0, b'*', ..] => "TIFF",
+            [b'B', b'M', ..] => "BMP",
+            [b'G', b'I', b'F', b'8', ..] => "GIF",
+            _ => return None,
+        };
+        FORMATS.into_iter().find(|format| format.name == name)
     }
 
     /// Returns the command that converts all files with the folder and extension of one of `paths`.
@@ -143,7 +144,7 @@ mod tests {
     #[test]
     fn paths_in_commands_are_quoted() {
         assert_eq!(
-            HEIC.command([Path::new("/data/Tom's set/IMG 1.HEIC")].into_iter()),
+            FORMATS[0].command([Path::new("/data/Tom's set/IMG 1.HEIC")].into_iter()),
             r"magick mogrify -format jpg -quality 98 '/data/Tom'\''s set'/*.HEIC"
         );
         let files = ["a.HEIC", "b.heic", "c.HEIC"].map(PathBuf::from);

@@ -36,12 +36,12 @@ pub(crate) fn unused_mask_warnings(
             let path = folder.join(&name);
             let is_copy = !used.is_empty() && is_reduced_copy(&name);
             if looks_like_mask(&name) && !is_copy && listings.is_folder(&path) {
-                candidates.push((path.clone(), images_below(listings, &path, MAX_DEPTH)));
+                candidates.push((path.clone(), images_in(listings, &path, MAX_DEPTH)));
             }
         }
     }
     for folder in parents {
-        let mut files = images_in(listings, folder);
+        let mut files = images_in(listings, folder, 0);
         files.retain(|file| {
             file.file_stem().is_some_and(|stem| looks_like_mask(&stem.to_string_lossy()))
         });
@@ -88,19 +88,14 @@ fn is_reduced_copy(name: &str) -> bool {
     name.strip_prefix("masks_").is_some_and(|factor| factor.parse::<u32>().is_ok())
 }
 
-fn images_in(listings: &mut Listings, folder: &Path) -> Vec<PathBuf> {
-    let paths = listings.names(folder).into_iter().map(|name| folder.join(name));
-    paths.filter(|path| is_image_name(path)).collect()
-}
-
-fn images_below(listings: &mut Listings, folder: &Path, depth: usize) -> Vec<PathBuf> {
-    let mut found = images_in(listings, folder);
-    if depth > 0 {
-        for name in listings.names(folder) {
-            let path = folder.join(name);
-            if listings.is_folder(&path) {
-                found.extend(images_below(listings, &path, depth - 1));
-            }
+/// Returns the images in a folder and, down to a depth, in its sub-folders.
+fn images_in(listings: &mut Listings, folder: &Path, depth: usize) -> Vec<PathBuf> {
+    let names = listings.names(folder).into_iter();
+    let (mut found, others): (Vec<PathBuf>, Vec<PathBuf>) =
+        names.map(|name| folder.join(name)).partition(|path| is_image_name(path));
+    for path in others {
+        if depth > 0 && listings.is_folder(&path) {
+            found.extend(images_in(listings, &path, depth - 1));
         }
     }
     found

@@ -16,10 +16,6 @@ pub struct DepthMap<'a> {
 /// Minimum opacity of a surface: the median depth is only defined for an opacity of at least 0.5.
 const MIN_SURFACE_OPACITY: f32 = 0.5;
 
-fn is_surface(opacity: f32) -> bool {
-    opacity >= MIN_SURFACE_OPACITY
-}
-
 impl<'a> DepthMap<'a> {
     /// Wraps the channels of an EXR image; `None` if one is missing.
     pub fn of(image: &'a ExrImage) -> Option<Self> {
@@ -31,7 +27,7 @@ impl<'a> DepthMap<'a> {
     /// # Panics
     /// If the index is out of range.
     pub fn has_surface(&self, pixel: usize) -> bool {
-        is_surface(self.opacity[pixel])
+        self.opacity[pixel] >= MIN_SURFACE_OPACITY
     }
 
     /// Returns the 1 % and 99 % quantiles of the surfaces' depths in scene units, the range to

@@ -19,25 +19,10 @@ pub enum PixelError {
         /// Reason, as a sentence fragment.
         reason: String,
     },
-    /// The image format is not supported, or the image has more than [`MAX_PIXELS`] pixels.
+    /// The image format is not supported, the image has more than [`MAX_PIXELS`] pixels, or a sample
+    /// is NaN or infinite.
     #[error("{0}")]
     Unsupported(String),
-    /// A sample is NaN or infinite.
-    #[error("{path}: channel {channel} is {value} at column {x}, row {y}; {remedy}")]
-    NotFinite {
-        /// Path of the image.
-        path: PathBuf,
-        /// Name of the channel.
-        channel: String,
-        /// Column of the pixel.
-        x: usize,
-        /// Row of the pixel.
-        y: usize,
-        /// Value of the sample.
-        value: f32,
-        /// Consequence for the file, or remedy for the user.
-        remedy: &'static str,
-    },
 }
 
 impl PixelError {

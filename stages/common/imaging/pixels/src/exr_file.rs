@@ -59,14 +59,9 @@ impl ExrImage {
         for name in names {
             let samples = self.channel(name).unwrap_or_default();
             if let Some(index) = samples.iter().position(|sample| !sample.is_finite()) {
-                return Err(PixelError::NotFinite {
-                    path: path.to_path_buf(),
-                    channel: (*name).to_owned(),
-                    x: index % self.width,
-                    y: index / self.width,
-                    value: samples[index],
-                    remedy: "export the image again with finite samples",
-                });
+                let pixel = [index % self.width, index / self.width];
+                let remedy = "export the image again with finite samples";
+                return Err(not_finite(path, name, pixel, samples[index], remedy));
             }
         }
         Ok(self)
@@ -179,7 +174,9 @@ fn header<'a>(
     header
 }
 
-fn check_finite(
+/// Fails at the first sample, in a band of rows from `first`, that is NaN or infinite; `path` names
+/// the file that would have the samples.
+pub fn check_finite(
     path: &Path,
     channels: &[Channel],
     width: usize,
@@ -188,14 +185,22 @@ fn check_finite(
 ) -> Result<(), PixelError> {
     let Some(index) = samples.iter().position(|v| !v.is_finite()) else { return Ok(()) };
     let pixel = index / channels.len();
-    Err(PixelError::NotFinite {
-        path: path.to_path_buf(),
-        channel: channels[index % channels.len()].name.to_owned(),
-        x: pixel % width,
-        y: first + pixel / width,
-        value: samples[index],
-        remedy: "the file was not written",
-    })
+    let name = channels[index % channels.len()].name;
+    let pixel = [pixel % width, first + pixel / width];
+    Err(not_finite(path, name, pixel, samples[index], "the file was not written"))
+}
+
+fn not_finite(
+    path: &Path,
+    channel: &str,
+    [x, y]: [usize; 2],
+    value: f32,
+    remedy: &str,
+) -> PixelError {
+    PixelError::Unsupported(format!(
+        "{}: channel {channel} is {value} at column {x}, row {y}; {remedy}",
+        path.display()
+    ))
 }
 
 /// Returns the samples line by line, channel by channel (sorted by name), native-endian: the layout
@@ -212,11 +217,7 @@ fn block_bytes(samples: &[f32], width: usize, channels: &[Channel], order: &[usi
                         data.extend(half::f16::from_f32(v.clamp(-65504.0, 65504.0)).to_ne_bytes());
                     }
                 }
-                SampleType::Float => {
-                    for v in line {
-                        data.extend(v.to_ne_bytes());
-                    }
-                }
+                SampleType::Float => line.for_each(|v| data.extend(v.to_ne_bytes())),
             }
         }
     }
@@ -230,7 +231,8 @@ fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
 /// Reads the image's width and height, those of the display window, from the header; fails above
 /// [`MAX_PIXELS`](crate::MAX_PIXELS).
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
-    Ok(read_windows(path)?.size)
+    let [size, _] = read_windows(path)?;
+    Ok(size)
 }
 
 /// Returns the peak memory of [`read_exr`] in bytes, estimated from the header: each sample of the
@@ -244,17 +246,10 @@ pub fn exr_reading_bytes(path: &Path) -> Result<u64, PixelError> {
     Ok(4 * samples.sum::<u64>())
 }
 
-/// Image's size, and the position of the first layer's data window in the image.
-struct Windows {
-    /// Width and height of the display window.
-    size: (usize, usize),
-    /// Column and row of the data window's first pixel.
-    start: (usize, usize),
-}
-
-/// Reads the windows of the first layer from the header. Fails if the data window is not inside the
+/// Reads the windows of the first layer from the header: width and height of the display window, and
+/// column and row of the data window's first pixel. Fails if the data window is not inside the
 /// display window: pixels outside the image have no place in it.
-fn read_windows(path: &Path) -> Result<Windows, PixelError> {
+fn read_windows(path: &Path) -> Result<[(usize, usize); 2], PixelError> {
     let meta = read_header(path)?;
     let first = meta.headers.first().ok_or_else(|| PixelError::format(path, "no layer"))?;
     let (data, image) = (first.data_window(), first.shared_attributes.display_window);
@@ -271,7 +266,7 @@ fn read_windows(path: &Path) -> Result<Windows, PixelError> {
         return Err(PixelError::format(path, format!("{}×{} pixels", size.0, size.1)));
     }
     if let (Some(left), Some(top)) = (left, top) {
-        return Ok(Windows { size, start: (left, top) });
+        return Ok([size, (left, top)]);
     }
     let [data, image] = [data, image].map(|window| {
         let (Vec2(width, height), Vec2(x, y)) = (window.size, window.position);
@@ -308,7 +303,7 @@ fn read_header(path: &Path) -> Result<MetaData, PixelError> {
 
 /// Reads every channel of the first layer as f32, padded with zeros to the display window.
 pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
-    let windows = read_windows(path)?;
+    let [(width, height), start] = read_windows(path)?;
     let image = exr::prelude::read()
         .no_deep_data()
         .largest_resolution_level()
@@ -327,16 +322,19 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
         .into_iter()
         .map(|c| {
             let samples = c.sample_data.values_as_f32().collect();
-            (c.name.to_string(), padded(samples, data_width, &windows))
+            (c.name.to_string(), padded(samples, data_width, (width, height), start))
         })
         .collect();
-    let (width, height) = windows.size;
     Ok(ExrImage { width, height, channels })
 }
 
 /// Pads the samples of a data window of the given width with zeros to the display window.
-fn padded(samples: Vec<f32>, data_width: usize, windows: &Windows) -> Vec<f32> {
-    let ((width, height), (left, top)) = (windows.size, windows.start);
+fn padded(
+    samples: Vec<f32>,
+    data_width: usize,
+    (width, height): (usize, usize),
+    (left, top): (usize, usize),
+) -> Vec<f32> {
     if samples.len() == width * height {
         return samples;
     }
@@ -501,8 +499,9 @@ mod tests {
                 samples[3 * 5 + 2] = f32::NAN;
                 Ok::<(), PixelError>(())
             });
-        assert!(matches!(result, Err(PixelError::NotFinite { x: 1, y: 1, ref channel,
-                .. }) if channel == "Z"));
+        let message = result.unwrap_err().to_string();
+        let expected = "a.exr: channel Z is NaN at column 1, row 1; the file was not written";
+        assert!(message.ends_with(expected), "{message}");
     }
 
     #[test]

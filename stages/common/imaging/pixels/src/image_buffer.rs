@@ -31,26 +31,20 @@ impl From<DynamicImage> for Rgba8 {
         // Faster than `into_rgba8`: crate `image` is compiled with little optimisation
         // (Cargo.toml).
         let data = match image {
-            DynamicImage::ImageRgb8(image) => rgba_from_rgb(&image),
-            DynamicImage::ImageLuma8(image) => rgba_from_grey(&image),
+            DynamicImage::ImageRgb8(image) => opaque_rgba::<3>(&image),
+            DynamicImage::ImageLuma8(image) => opaque_rgba::<1>(&image),
             other => other.into_rgba8().into_raw(),
         };
         Self::new(width, height, data)
     }
 }
 
-fn rgba_from_rgb(rgb: &[u8]) -> Vec<u8> {
-    let mut rgba = vec![u8::MAX; rgb.len() / 3 * 4];
-    for (i, pixel) in rgb.as_chunks::<3>().0.iter().enumerate() {
-        rgba[4 * i..4 * i + 3].copy_from_slice(pixel);
-    }
-    rgba
-}
-
-fn rgba_from_grey(levels: &[u8]) -> Vec<u8> {
-    let mut rgba = vec![u8::MAX; levels.len() * 4];
-    for (i, level) in levels.iter().enumerate() {
-        rgba[4 * i..4 * i + 3].fill(*level);
+/// Adds alpha to pixels of `N` samples, three for RGB and one for grey.
+fn opaque_rgba<const N: usize>(samples: &[u8]) -> Vec<u8> {
+    let pixels = samples.as_chunks::<N>().0;
+    let mut rgba = vec![u8::MAX; 4 * pixels.len()];
+    for (out, pixel) in rgba.as_chunks_mut::<4>().0.iter_mut().zip(pixels) {
+        *out = [pixel[0], pixel[1 % N], pixel[2 % N], u8::MAX];
     }
     rgba
 }

@@ -45,8 +45,8 @@ pub use depth_map::{DepthMap, common_range};
 pub use error::{MAX_PIXELS, PixelError};
 pub use exposure::Exposure;
 pub use exr_file::{
-    COLOUR_CHANNELS, Channel, DEPTH_CHANNELS, ExrImage, SampleType, exr_reading_bytes, exr_size,
-    read_exr, read_premultiplied, write_exr,
+    COLOUR_CHANNELS, Channel, DEPTH_CHANNELS, ExrImage, SampleType, check_finite,
+    exr_reading_bytes, exr_size, read_exr, read_premultiplied, write_exr,
 };
 pub use image_buffer::{Image, Rgba8, psnr_of};
 pub use mask::{MIN_BRIGHT_LEVEL, Mask};

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::intrinsics::Intrinsics;
 use crate::lens::Distortion;
-use crate::pose::{MAX_ROTATION_ERROR, Pose, moved, rotation_error, rotation_of};
+use crate::pose::{MAX_ROTATION_ERROR, Pose, column_of, moved, rotation_error, rotation_of};
 
 /// Camera: intrinsics and pose.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -104,8 +104,7 @@ impl Camera {
 
     /// Returns the camera's centre in world space.
     pub fn centre(&self) -> DVec3 {
-        let m = &self.camera_to_world;
-        DVec3::new(m[0][3], m[1][3], m[2][3])
+        column_of(&self.camera_to_world, 3)
     }
 
     /// Returns the viewing direction: -z of the camera, unit length.
@@ -216,13 +215,20 @@ impl Camera {
             let problem = format!("image size {width}×{height}; both must be at least 1");
             return Err(CameraError::Intrinsics(problem));
         }
-        for (name, value, side) in [("fx", fx, width), ("fy", fy, height)] {
-            check_intrinsic(name, value, value > 0.0)?;
-            check_proportion(name, "focal length", value, side, ALLOWED_FOCAL_LENGTHS)?;
-        }
-        for (name, value, side) in [("cx", cx, width), ("cy", cy, height)] {
-            check_intrinsic(name, value, true)?;
-            check_proportion(name, "principal point", value, side, ALLOWED_PRINCIPAL_POINTS)?;
+        for (name, value, side, quantity, allowed) in [
+            ("fx", fx, width, "focal length", ALLOWED_FOCAL_LENGTHS),
+            ("fy", fy, height, "focal length", ALLOWED_FOCAL_LENGTHS),
+            ("cx", cx, width, "principal point", ALLOWED_PRINCIPAL_POINTS),
+            ("cy", cy, height, "principal point", ALLOWED_PRINCIPAL_POINTS),
+        ] {
+            // NaN is not allowed.
+            if !allowed.contains(&(value / f64::from(side))) {
+                return Err(CameraError::Intrinsics(format!(
+                    "{name} is {} pixels, but the image's side is {side} pixels; check that the \
+                    {quantity} is in pixels and belongs to this image",
+                    format_number(value)
+                )));
+            }
         }
         Ok(())
     }
@@ -234,35 +240,6 @@ const ALLOWED_FOCAL_LENGTHS: RangeInclusive<f64> = 1e-4..=1e4;
 /// Allowed coordinates of the principal point, relative to the image's side. A crop of a photograph
 /// may be far from the principal point.
 const ALLOWED_PRINCIPAL_POINTS: RangeInclusive<f64> = -1e4..=1e4;
-
-fn check_intrinsic(name: &str, value: f64, is_allowed: bool) -> Result<(), CameraError> {
-    if value.is_finite() && is_allowed {
-        Ok(())
-    } else {
-        Err(CameraError::Intrinsics(format!(
-            "{name} is {}; focal lengths must be above 0 and principal points finite",
-            format_number(value)
-        )))
-    }
-}
-
-fn check_proportion(
-    name: &str,
-    quantity: &str,
-    value: f64,
-    side: u32,
-    allowed: RangeInclusive<f64>,
-) -> Result<(), CameraError> {
-    if allowed.contains(&(value / f64::from(side))) {
-        Ok(())
-    } else {
-        Err(CameraError::Intrinsics(format!(
-            "{name} is {} pixels, but the image's side is {side} pixels; check that the {quantity} \
-            is in pixels and belongs to this image",
-            format_number(value)
-        )))
-    }
-}
 
 #[cfg(test)]
 mod tests {
@@ -382,7 +359,7 @@ mod tests {
         assert_refused(&bad, "camera_to_world[1][2] is NaN; poses must be finite");
         let mut bad = good.clone();
         bad.intrinsics.fx = 0.0;
-        assert_refused(&bad, "fx is 0; focal lengths must be above 0");
+        assert_refused(&bad, "fx is 0 pixels, but the image's side is 37 pixels");
         for (fx, cy, reason) in [
             (
                 1e300,

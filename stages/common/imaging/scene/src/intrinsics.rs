@@ -100,22 +100,18 @@ impl Intrinsics {
         if self.distortion.is_none() {
             return Some(self.zoomed_pinhole(1.0));
         }
-        let mut low = self.min_zoom();
-        let mut high = MAX_ZOOM;
-        if !self.contains_view(&self.zoomed_pinhole(high)) {
+        let fits = |zoom| self.contains_view(&self.zoomed_pinhole(zoom));
+        let (mut low, mut high) = (self.min_zoom(), MAX_ZOOM);
+        if !fits(high) {
             return None;
         }
-        if self.contains_view(&self.zoomed_pinhole(low)) {
-            return Some(self.zoomed_pinhole(low));
+        if fits(low) {
+            high = low;
         }
         // Bisection of the zoom, until it moves no corner by a hundredth of a pixel.
         while (high - low) * f64::from(self.width.max(self.height)) > 0.01 {
             let middle = 0.5 * (low + high);
-            if self.contains_view(&self.zoomed_pinhole(middle)) {
-                high = middle;
-            } else {
-                low = middle;
-            }
+            *(if fits(middle) { &mut high } else { &mut low }) = middle;
         }
         Some(self.zoomed_pinhole(high))
     }

@@ -57,21 +57,15 @@ mod radial {
     }
 }
 
+/// Lists the coefficients that aren't 0.
 impl fmt::Display for Distortion {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let ([k1, k2, k3, k4], [p1, p2]) =
-            (self.radial.map(format_number), self.tangential.map(format_number));
-        let lens = if self.is_fisheye() { "fisheye, " } else { "" };
-        write!(f, "({lens}k1 {k1}, k2 {k2}, k3 {k3}, ")?;
-        if self.radial[3] != 0.0 {
-            write!(f, "k4 {k4}, ")?;
-        }
-        write!(f, "p1 {p1}, p2 {p2}")?;
-        if !is_zero(&self.denominator) {
-            let [d1, d2, d3] = self.denominator.map(format_number);
-            write!(f, ", denominator {d1}, {d2}, {d3}")?;
-        }
-        f.write_str(")")
+        let names = ["k1", "k2", "k3", "k4", "p1", "p2", "d1", "d2", "d3"];
+        let values = self.radial.iter().chain(&self.tangential).chain(&self.denominator);
+        let terms = names.iter().zip(values).filter(|(_, value)| **value != 0.0);
+        let terms = terms.map(|(name, value)| format!("{name} {}", format_number(*value)));
+        let lens = self.is_fisheye().then(|| "fisheye".to_owned());
+        write!(f, "({})", lens.into_iter().chain(terms).collect::<Vec<_>>().join(", "))
     }
 }
 

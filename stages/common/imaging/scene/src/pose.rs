@@ -36,9 +36,14 @@ pub(crate) fn rotation_error(rotation: DMat3) -> f64 {
     deviation.to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()))
 }
 
+/// Returns a column of a pose: an axis or, with index 3, the centre.
+pub(crate) fn column_of(pose: &Pose, index: usize) -> DVec3 {
+    DVec3::new(pose[0][index], pose[1][index], pose[2][index])
+}
+
 /// Returns the rotation R of a pose, its left 3×3 part.
 pub(crate) fn rotation_of(pose: &Pose) -> DMat3 {
-    DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| [pose[0][c], pose[1][c], pose[2][c]]))
+    DMat3::from_cols(column_of(pose, 0), column_of(pose, 1), column_of(pose, 2))
 }
 
 /// Removes a uniform scale from a pose's rotation. Returns the pose with the same centre, and the
@@ -53,8 +58,7 @@ pub fn without_scale(pose: &Pose) -> Option<(Pose, f64)> {
     let scale = (squares / 3.0).sqrt();
     let rigid = rotation * (1.0 / scale);
     let is_rigid = rigid.is_finite() && rotation_error(rigid) <= MAX_ROTATION_ERROR;
-    let centre = DVec3::new(pose[0][3], pose[1][3], pose[2][3]);
-    is_rigid.then(|| (pose_of(rigid, centre), scale))
+    is_rigid.then(|| (pose_of(rigid, column_of(pose, 3)), scale))
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@ use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::pose::{Pose, moved, pose_of, rotation_of};
+use crate::pose::{Pose, column_of, moved, pose_of, rotation_of};
 
 /// Map from the world to a field's unit cube (docs/design/004).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -53,7 +53,7 @@ impl Frustum {
 
     /// Returns the virtual camera's centre.
     pub fn centre(&self) -> DVec3 {
-        self.column(3)
+        column_of(&self.camera_to_world, 3)
     }
 
     /// Converts a world point to the virtual camera's space: x to the right, y up, and depth.
@@ -64,11 +64,6 @@ impl Frustum {
     /// Converts a world direction to the virtual camera's space.
     pub fn rotate_to_camera(&self, direction: DVec3) -> DVec3 {
         rotation_of(&self.camera_to_world).transpose() * direction * DVec3::new(1.0, 1.0, -1.0)
-    }
-
-    fn column(&self, i: usize) -> DVec3 {
-        let [x, y, z] = self.camera_to_world;
-        DVec3::new(x[i], y[i], z[i])
     }
 
     /// Returns the side of the cube in slopes: the width of the wider range.
@@ -89,7 +84,8 @@ impl Frustum {
         let side = self.cube_side();
         let depth = 1.0 / (1.0 / self.near - position.z * (1.0 / self.near - 1.0 / self.far));
         let [x, y] = [0, 1].map(|i| (position[i] * side + self.min[i]) * depth);
-        self.column(3) + x * self.column(0) + y * self.column(1) - depth * self.column(2)
+        let [right, up, back, centre] = [0, 1, 2, 3].map(|i| column_of(&self.camera_to_world, i));
+        centre + x * right + y * up - depth * back
     }
 
     /// Returns the frustum of the scene moved by a vector.

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use artifact::Failure;
-use pixels::{Channel, PixelError, SampleType, write_exr};
+use pixels::{Channel, PixelError, SampleType, check_finite, write_exr};
 
 /// Returns the path of a view's EXR image in the output of a stage that renders or changes views.
 pub fn image_file(name: &str) -> String {
@@ -43,28 +43,11 @@ pub fn write_view_image<E: From<Failure> + From<PixelError>>(
     channels: &[Channel],
     mut band: impl FnMut(usize, usize, &mut [f32]) -> Result<(), E>,
 ) -> Result<(), E> {
-    let written = write_exr(path, size, channels, VIEW_NOTE, |first, rows, samples| {
-        band(first, rows, samples).map_err(Stopped::Band)
-    });
-    written.map_err(|stopped| match stopped {
-        Stopped::Pixels(error @ PixelError::NotFinite { .. }) => {
-            Failure::Numerical(error.to_string()).into()
-        }
-        Stopped::Pixels(error) => error.into(),
-        Stopped::Band(error) => error,
+    write_exr(path, size, channels, VIEW_NOTE, |first, rows, samples| {
+        band(first, rows, samples)?;
+        check_finite(path, channels, size.0, first, samples)
+            .map_err(|error| Failure::Numerical(error.to_string()).into())
     })
-}
-
-/// Error of [`write_exr`] or of the caller's `band`.
-enum Stopped<E> {
-    Pixels(PixelError),
-    Band(E),
-}
-
-impl<E> From<PixelError> for Stopped<E> {
-    fn from(error: PixelError) -> Self {
-        Self::Pixels(error)
-    }
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use anyhow::{anyhow, ensure};
 use artifact::{Failure, FailureExt as _, GivenInput, relative_path};
 use pixels::{Image, Mask, PixelError, read_png, read_premultiplied};
 use schemars::JsonSchema;
@@ -175,11 +176,6 @@ impl Background {
     }
 }
 
-/// Error returned when `views.json` is invalid.
-#[derive(Debug, thiserror::Error)]
-#[error("{VIEWS_FILE}: {0}")]
-pub struct ViewsError(String);
-
 impl Views {
     /// Creates a list of views with the current conventions.
     pub fn new(background: Background, bounds: Bounds, views: Vec<View>) -> Self {
@@ -223,43 +219,33 @@ impl Views {
 
     /// Fails for an empty list, invalid cameras, names or paths that leave the folder, and empty
     /// bounds.
-    pub fn check(&self) -> Result<(), ViewsError> {
-        if self.views.is_empty() {
-            return Err(ViewsError("no views found".to_owned()));
-        }
-        if !self.bounds.is_valid() {
-            let problem = format!("bounds {:?} are empty or not finite", self.bounds);
-            return Err(ViewsError(problem));
-        }
+    pub fn check(&self) -> anyhow::Result<()> {
+        ensure!(!self.views.is_empty(), "{VIEWS_FILE}: no views found");
+        ensure!(
+            self.bounds.is_valid(),
+            "{VIEWS_FILE}: bounds {:?} are empty or not finite",
+            self.bounds
+        );
         let mut names = BTreeSet::new();
         for view in &self.views {
             let name = &view.camera.name;
             let is_plain = relative_path(name).is_ok_and(|p| p.components().count() == 1)
                 && !name.contains(char::is_control);
-            if !is_plain || !names.insert(name) {
-                let problem = format!("view name {name:?} is used twice or can't name a file");
-                return Err(ViewsError(problem));
-            }
-            view.camera
-                .check()
-                .map_err(|problem| ViewsError(format!("view {name:?}: {problem}")))?;
-            for path in
-                [&view.image, &view.mask, &view.depth, &view.low_resolution].into_iter().flatten()
-            {
-                check_path(path)?;
+            ensure!(
+                is_plain && names.insert(name),
+                "{VIEWS_FILE}: view name {name:?} is used twice or can't name a file"
+            );
+            view.camera.check().map_err(|error| anyhow!("{VIEWS_FILE}: view {name:?}: {error}"))?;
+            let View { image, mask, depth, low_resolution, .. } = view;
+            for path in [image, mask, depth, low_resolution].into_iter().flatten() {
+                relative_path(path).map_err(|error| anyhow!("{VIEWS_FILE}: {error}"))?;
+                // A terminal would interpret control characters.
+                ensure!(
+                    !path.contains(char::is_control),
+                    "{VIEWS_FILE}: {path:?} has control characters"
+                );
             }
         }
-        Ok(())
-    }
-}
-
-/// Fails for paths that leave the folder or contain control characters, which a terminal would
-/// interpret.
-fn check_path(path: &str) -> Result<(), ViewsError> {
-    relative_path(path).map_err(|e| ViewsError(e.to_string()))?;
-    if path.contains(char::is_control) {
-        Err(ViewsError(format!("{path:?} has control characters")))
-    } else {
         Ok(())
     }
 }

@@ -258,7 +258,7 @@ fn image_parameters(set: &Dataset) -> String {
 /// command that estimates their cameras.
 fn read_failure(folder: &Path, error: &DatasetError) -> Failure {
     let images = UnposedImages::find(folder);
-    if !error.is_unrecognised() || images.files.is_empty() {
+    if !matches!(error, DatasetError::Unrecognised(_)) || images.files.is_empty() {
         return Failure::BadInput(error.to_string());
     }
     let remedy = if images.files.len() == 1 {

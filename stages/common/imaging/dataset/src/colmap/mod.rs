@@ -8,22 +8,25 @@ mod points;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context as _, anyhow, bail};
 use artifact::{WARNING, format_count, relative_path};
 use scene::Intrinsics;
 
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, Problem, Reason};
-use crate::file_status::{check_link, is_file, name_text, path_text, sub_folders, visible_entries};
+use crate::error::{frame_label, images_missing};
+use crate::file_status::{
+    FileProblem, check_link, name_text, path_text, sub_folders, visible_entries,
+};
 use crate::format::Format;
 use crate::frame::assign_names;
-use crate::lookup::{Listings, Located, Lookup, reduced_copies};
+use crate::lookup::{Listings, Lookup, reduced_copies};
 use crate::photograph::is_image_name;
-use model::Model;
+use model::{Model, find_list};
 
 /// Finds the models in `sparse` and its sub-folders, sorted by name. If there are none and the
 /// folder has photographs, the folder itself may be a model; otherwise searches the `sparse` of
 /// each sub-folder without photographs: nerfstudio writes `colmap/sparse/0`.
-pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, DatasetError> {
+pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, FileProblem> {
     let found = folders_with_list(folder, "images")?;
     if !found.is_empty() {
         return Ok(found);
@@ -47,9 +50,7 @@ pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, DatasetError> {
 
 /// True if a folder has COLMAP's lists of images and cameras.
 pub(crate) fn is_model(folder: &Path) -> bool {
-    ["images", "cameras"].iter().all(|name| {
-        ["bin", "txt"].iter().any(|kind| folder.join(name).with_extension(kind).is_file())
-    })
+    ["images", "cameras"].iter().all(|name| matches!(find_list(folder, name), Ok(Some(_))))
 }
 
 /// True if an image of the first model exists, also in a wrong sub-folder, or the model can't be
@@ -62,7 +63,7 @@ pub(crate) fn has_photographs(folder: &Path) -> bool {
     }
     let names: Vec<&str> = model.images.iter().map(|image| image.name.as_str()).collect();
     let mut lookup = Lookup::in_images(folder, &names);
-    names.iter().any(|name| matches!(lookup.find(name), Ok(Located::File(_))))
+    names.iter().any(|name| lookup.find(name).is_ok())
         || names.first().is_some_and(|first| folder_of_image(folder, first).is_some())
 }
 
@@ -72,7 +73,7 @@ fn has_images(folder: &Path) -> bool {
 }
 
 /// Returns the image names of the first model in `sparse`, if any.
-pub(crate) fn image_names(folder: &Path) -> Result<Vec<String>, DatasetError> {
+pub(crate) fn image_names(folder: &Path) -> anyhow::Result<Vec<String>> {
     let mut model = Model::default();
     if let Some(first) = folders_with_list(folder, "images")?.first() {
         model.read_images(first)?;
@@ -81,7 +82,7 @@ pub(crate) fn image_names(folder: &Path) -> Result<Vec<String>, DatasetError> {
 }
 
 /// Returns the cameras of the first model in `sparse`. The model's images aren't read.
-pub(crate) fn read_cameras(folder: &Path) -> Result<Vec<Intrinsics>, DatasetError> {
+pub(crate) fn read_cameras(folder: &Path) -> anyhow::Result<Vec<Intrinsics>> {
     let mut model = Model::default();
     if let Some(first) = folders_with_list(folder, "cameras")?.first() {
         model.read_cameras(first)?;
@@ -90,15 +91,14 @@ pub(crate) fn read_cameras(folder: &Path) -> Result<Vec<Intrinsics>, DatasetErro
 }
 
 /// Returns `sparse` and its sub-folders that contain the list `NAME.bin` or `NAME.txt`, sorted.
-fn folders_with_list(folder: &Path, name: &str) -> Result<Vec<PathBuf>, DatasetError> {
+fn folders_with_list(folder: &Path, name: &str) -> Result<Vec<PathBuf>, FileProblem> {
     let sparse = folder.join("sparse");
     check_link(&sparse)?;
     let mut candidates = visible_entries(&sparse);
     candidates.insert(0, sparse);
     let mut found = Vec::new();
     for path in candidates {
-        let list = path.join(name);
-        if is_file(&list.with_extension("bin"))? || is_file(&list.with_extension("txt"))? {
+        if find_list(&path, name)?.is_some() {
             found.push(path);
         }
     }
@@ -107,36 +107,33 @@ fn folders_with_list(folder: &Path, name: &str) -> Result<Vec<PathBuf>, DatasetE
 
 /// Reads the model with the most images (the first one, if several have as many), and finds the
 /// files of its images.
-pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
+pub(crate) fn read(folder: &Path) -> anyhow::Result<Dataset> {
     let models = find_models(folder)?;
     let (path, mut model, choice) = read_largest_model(folder, &models)?;
     let far_points = model.remove_far_points();
     // COLMAP's order of registration is arbitrary.
     model.images.sort_by(|a, b| a.name.cmp(&b.name));
-    let list =
-        path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
+    let list = find_list(path, "images")?.unwrap_or_else(|| path.to_path_buf());
     check_link(&folder.join("images"))?;
     let image_names: Vec<&str> = model.images.iter().map(|image| image.name.as_str()).collect();
     let mut lookup = Lookup::in_images(folder, &image_names);
     let (mut frames, mut labels, mut missing) = (Vec::new(), Vec::new(), Vec::new());
     let mut files = Vec::new();
     for (index, image) in model.images.iter().enumerate() {
-        let frame_error = |reason| DatasetError::frame(&list, index, &image.name, reason);
-        match lookup.find(&image.name).map_err(|e| frame_error(e.into()))? {
-            Located::File(file) => {
-                frames.push(model.frame(image, folder.join(&file.path)).map_err(frame_error)?);
-                labels.push(lookup.without_base(&file.label));
-                files.push(file.path);
+        let label = || frame_label(&list, index, &image.name);
+        let file = match lookup.find(&image.name) {
+            Err(error) if error.is_missing() => {
+                missing.push(&image.name);
+                continue;
             }
-            Located::Missing(_) => missing.push(&image.name),
-            Located::Unusable(problem) => {
-                let remedy = "put the photograph there";
-                return Err(frame_error(Reason::unusable(&problem, remedy)));
-            }
-        }
+            found => found.with_context(label)?,
+        };
+        frames.push(model.frame(image, folder.join(&file.path)).with_context(label)?);
+        labels.push(lookup.without_base(&file.label));
+        files.push(file.path);
     }
     if frames.is_empty() {
-        return Err(DatasetError::format(&list, no_photographs(&lookup, &missing)));
+        bail!(no_photographs(&lookup, &missing).context(path_text(&list)));
     }
     let name = path.strip_prefix(folder).map(path_text).unwrap_or_default();
     let name = if name.is_empty() { "the folder itself" } else { &name };
@@ -158,15 +155,15 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
 
 /// Returns the reason for a model none of whose images exists, with the sub-folder that contains
 /// the first image, if any.
-fn no_photographs(lookup: &Lookup, missing: &[&String]) -> Reason {
+fn no_photographs(lookup: &Lookup, missing: &[&String]) -> anyhow::Error {
     let Some(first) = missing.first() else {
-        return Reason::new("the model has no images; at least one is required");
+        return anyhow!("the model has no images; at least one is required");
     };
-    let reason = Reason::images_missing(missing.len(), Some(&lookup.base()), first);
+    let reason = images_missing(missing.len(), Some(&lookup.base()), first);
     match folder_of_image(lookup.root(), first) {
         Some(found) => {
             let name = name_text(&found);
-            reason.with_remedy(&format!("the image is in {name}: rename this folder images"))
+            anyhow!("{reason}; the image is in {name}: rename this folder images")
         }
         None => reason,
     }
@@ -214,7 +211,7 @@ fn unregistered_note(folder: &Path, files: &[PathBuf]) -> Option<String> {
 fn read_largest_model<'a>(
     folder: &Path,
     models: &'a [PathBuf],
-) -> Result<(&'a Path, Model, Option<String>), DatasetError> {
+) -> anyhow::Result<(&'a Path, Model, Option<String>)> {
     let mut largest: Option<(&Path, Model)> = None;
     let mut sizes = Vec::new();
     for path in models {
@@ -225,8 +222,7 @@ fn read_largest_model<'a>(
             largest = Some((path, model));
         }
     }
-    let (path, model) = largest
-        .ok_or_else(|| Problem::Unrecognised { path: folder.to_path_buf(), finding: None })?;
+    let (path, model) = largest.context("no COLMAP model found")?;
     let choice = (models.len() > 1).then(|| {
         let (count, sizes) = (models.len(), sizes.join(", "));
         format!("{count} models; using the one with the most images ({sizes})")

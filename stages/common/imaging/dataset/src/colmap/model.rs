@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
+use anyhow::{Context as _, anyhow, bail, ensure};
 use artifact::{format_number, shortened};
 use glam::{DMat3, DQuat, DVec3};
 use scene::Intrinsics;
@@ -11,8 +12,7 @@ use scene::Intrinsics;
 use super::bytes::Bytes;
 use super::camera::{CameraModel, UNDISTORT};
 use super::points::{Reach, depth_range, removed_points_note};
-use crate::error::{DatasetError, Reason};
-use crate::file_status::is_file;
+use crate::file_status::{FileProblem, is_file, path_text};
 use crate::frame::{Frame, pose_from_world_to_camera};
 use crate::photograph::{fit_camera, read_header};
 use crate::text::read_text;
@@ -44,114 +44,121 @@ impl Image {
     }
 }
 
-/// Reads a file of a folder; `None` if it doesn't exist.
-fn read_if_present(folder: &Path, name: &str) -> Result<Option<(PathBuf, Vec<u8>)>, DatasetError> {
-    let path = folder.join(name);
-    if !is_file(&path)? {
-        return Ok(None);
+/// Finds the binary or, if there is none, the text file of a model's list; `None` if neither
+/// exists.
+pub(super) fn find_list(folder: &Path, name: &str) -> Result<Option<PathBuf>, FileProblem> {
+    for extension in ["bin", "txt"] {
+        let path = folder.join(name).with_extension(extension);
+        if is_file(&path)? {
+            return Ok(Some(path));
+        }
     }
-    let bytes = std::fs::read(&path).map_err(|source| DatasetError::io(&path, source))?;
-    Ok(Some((path, bytes)))
+    Ok(None)
 }
 
 impl Model {
     /// Reads the model of a folder, binary files before text files. Points are optional.
-    pub(super) fn read(folder: &Path) -> Result<Self, DatasetError> {
+    pub(super) fn read(folder: &Path) -> anyhow::Result<Self> {
         let mut model = Self::default();
         model.read_cameras(folder)?;
         model.read_images(folder)?;
-        if let Some((path, points)) = read_if_present(folder, "points3D.bin")? {
-            model.read_binary_points(&mut Bytes::new(&path, &points))?;
-        } else if is_file(&folder.join("points3D.txt"))? {
-            model.read_text_points(&folder.join("points3D.txt"))?;
+        if let Some(path) = find_list(folder, "points3D")? {
+            model.read_list(&path, Self::read_binary_points, Self::read_text_points)?;
         }
         Ok(model)
     }
 
-    pub(super) fn read_cameras(&mut self, folder: &Path) -> Result<(), DatasetError> {
-        match read_if_present(folder, "cameras.bin")? {
-            Some((path, cameras)) => self.read_binary_cameras(&mut Bytes::new(&path, &cameras)),
-            None if is_file(&folder.join("images.bin"))?
-                && !is_file(&folder.join("cameras.txt"))? =>
-            {
-                let reason =
-                    Reason::new("file not found next to images.bin; copy all files of the model");
-                Err(DatasetError::format(&folder.join("cameras.bin"), reason))
-            }
-            None => self.read_text_cameras(&folder.join("cameras.txt")),
-        }
+    pub(super) fn read_cameras(&mut self, folder: &Path) -> anyhow::Result<()> {
+        let path = find_list(folder, "cameras")?.with_context(|| {
+            let path = path_text(&folder.join("cameras.bin"));
+            format!("{path}: file not found; copy all files of the model")
+        })?;
+        self.read_list(&path, Self::read_binary_cameras, Self::read_text_cameras)
     }
 
-    pub(super) fn read_images(&mut self, folder: &Path) -> Result<(), DatasetError> {
-        match read_if_present(folder, "images.bin")? {
-            Some((path, images)) => self.read_binary_images(&mut Bytes::new(&path, &images)),
-            None => self.read_text_images(&folder.join("images.txt")),
-        }
+    pub(super) fn read_images(&mut self, folder: &Path) -> anyhow::Result<()> {
+        let path = find_list(folder, "images")?.unwrap_or_else(|| folder.join("images.txt"));
+        self.read_list(&path, Self::read_binary_images, Self::read_text_images)
     }
 
-    fn read_binary_cameras(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+    /// Reads a list by the function for its format.
+    fn read_list(
+        &mut self,
+        path: &Path,
+        read_binary: fn(&mut Self, &mut Bytes<'_>) -> anyhow::Result<()>,
+        read_lines: fn(&mut Self, &str) -> anyhow::Result<()>,
+    ) -> anyhow::Result<()> {
+        let read = if path.extension().is_some_and(|extension| extension == "bin") {
+            let bytes = std::fs::read(path).with_context(|| path_text(path))?;
+            let mut bytes = Bytes::new(&bytes);
+            read_binary(self, &mut bytes).and_then(|()| bytes.check_end())
+        } else {
+            read_lines(self, &read_text(path)?)
+        };
+        read.with_context(|| path_text(path))
+    }
+
+    fn read_binary_cameras(&mut self, bytes: &mut Bytes<'_>) -> anyhow::Result<()> {
         for _ in 0..bytes.count(24, "cameras")? {
-            let id = bytes.u32("a camera")?;
-            let model = bytes.u32("a camera")?;
-            let (width, height) = (bytes.u64("a camera")?, bytes.u64("a camera")?);
+            let (id, model) = (bytes.u32()?, bytes.u32()?);
+            let (width, height) = (bytes.u64()?, bytes.u64()?);
             let Some(model) = CameraModel::with_number(model) else {
                 let problem = format!("camera {id} has unknown model {model}");
-                return Err(bytes.error(format!("{problem} (from a newer COLMAP?); {UNDISTORT}")));
+                bail!(bytes.error(format!("{problem} (from a newer COLMAP?); {UNDISTORT}")));
             };
-            let parameters = (0..model.parameter_count)
-                .map(|_| bytes.f64("a camera"))
-                .collect::<Result<Vec<_>, _>>()?;
+            let parameters: anyhow::Result<Vec<f64>> =
+                model.parameters.iter().map(|_| bytes.f64()).collect();
             let intrinsics = model
-                .intrinsics(width, height, &parameters)
-                .map_err(|reason| bytes.error(reason.at(format!("camera {id}"))))?;
+                .intrinsics(width, height, &parameters?)
+                .map_err(|reason| bytes.error(format!("camera {id}: {reason}")))?;
             self.cameras.insert(id, intrinsics);
         }
-        bytes.check_end("cameras")
+        Ok(())
     }
 
-    fn read_binary_images(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+    fn read_binary_images(&mut self, bytes: &mut Bytes<'_>) -> anyhow::Result<()> {
         for _ in 0..bytes.count(73, "images")? {
-            let id = bytes.u32("an image")?;
-            let quaternion = bytes.f64s::<4>("an image")?;
-            let translation = bytes.f64s::<3>("an image")?.into();
-            let camera = bytes.u32("an image")?;
-            let name = bytes.text("an image's name")?.to_owned();
+            let id = bytes.u32()?;
+            let quaternion = bytes.f64s::<4>()?;
+            let translation = bytes.f64s::<3>()?.into();
+            let camera = bytes.u32()?;
+            let name = bytes.text()?.to_owned();
             let rotation = rotation_matrix(quaternion).map_err(|reason| {
-                bytes.error(reason.at(format!("image {id} ({})", shortened(&name))))
+                bytes.error(format!("image {id} ({}): {reason}", shortened(&name)))
             })?;
             let mut points = Vec::new();
             for _ in 0..bytes.count(24, "points of an image")? {
-                bytes.take(16, "a point of an image")?;
-                points.push(bytes.u64("a point of an image")?);
+                bytes.take(16)?;
+                points.push(bytes.u64()?);
             }
             self.images.push(Image { rotation, translation, camera, name, points });
         }
-        bytes.check_end("images")
+        Ok(())
     }
 
-    fn read_binary_points(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+    fn read_binary_points(&mut self, bytes: &mut Bytes<'_>) -> anyhow::Result<()> {
         for _ in 0..bytes.count(51, "points")? {
-            let id = bytes.u64("a point")?;
-            self.points.insert(id, bytes.f64s::<3>("a point")?.into());
-            bytes.take(11, "a point")?;
+            let id = bytes.u64()?;
+            self.points.insert(id, bytes.f64s::<3>()?.into());
+            bytes.take(11)?;
             let track = bytes.count(8, "images of a point")?;
-            bytes.take(8 * track, "a point's images")?;
+            bytes.take(8 * track)?;
         }
-        bytes.check_end("points")
+        Ok(())
     }
 
-    fn read_text_cameras(&mut self, path: &Path) -> Result<(), DatasetError> {
-        for line in TextLine::all(path, &read_text(path)?).filter(|l| !l.words.is_empty()) {
+    fn read_text_cameras(&mut self, text: &str) -> anyhow::Result<()> {
+        for line in TextLine::all(text).filter(|line| !line.words.is_empty()) {
             let id = line.number(0, "camera id")?;
             let name = line.words.get(1).copied().unwrap_or_default();
             let (width, height) = (line.number(2, "width")?, line.number(3, "height")?);
             let parameters = (4..line.words.len())
                 .map(|i| line.number(i, "parameter"))
-                .collect::<Result<Vec<f64>, _>>()?;
+                .collect::<anyhow::Result<Vec<f64>>>()?;
             let Some(model) = CameraModel::with_name(name) else {
                 let name = shortened(name);
                 let problem = format!("camera model {name:?} is unknown (from a newer COLMAP?)");
-                return Err(line.error(format!("{problem}; {UNDISTORT}")));
+                bail!(line.error(format!("{problem}; {UNDISTORT}")));
             };
             let intrinsics = model
                 .intrinsics(width, height, &parameters)
@@ -161,10 +168,9 @@ impl Model {
         Ok(())
     }
 
-    fn read_text_images(&mut self, path: &Path) -> Result<(), DatasetError> {
-        let text = read_text(path)?;
+    fn read_text_images(&mut self, text: &str) -> anyhow::Result<()> {
         // Two lines per image; the second one, its points, may be empty.
-        let mut lines = TextLine::all(path, &text);
+        let mut lines = TextLine::all(text);
         while let Some(line) = lines.next() {
             if line.words.is_empty() {
                 continue;
@@ -175,21 +181,15 @@ impl Model {
             let [x, y, z] = [5, 6, 7].map(|i| line.number(i, "translation"));
             let translation = DVec3::new(x?, y?, z?);
             let camera = line.number(8, "camera id")?;
-            if line.words.len() < 10 {
-                return Err(line.error("an image's name is missing"));
-            }
+            ensure!(line.words.len() >= 10, line.error("an image's name is missing"));
             let name = line.rest_after(9).to_owned();
             let points = match lines.next() {
                 None => Vec::new(),
                 Some(second) => second.points().ok_or_else(|| {
-                    let (number, image) = (second.number, line.words[0]);
-                    DatasetError::format(
-                        path,
-                        Reason::new(format!(
-                            "line {number} should be the points of image {image} (an empty line if \
-                            there are none)"
-                        )),
-                    )
+                    second.error(format!(
+                        "expected the points of image {} (an empty line if there are none)",
+                        line.words[0]
+                    ))
                 })?,
             };
             self.images.push(Image { rotation, translation, camera, name, points });
@@ -197,8 +197,8 @@ impl Model {
         Ok(())
     }
 
-    fn read_text_points(&mut self, path: &Path) -> Result<(), DatasetError> {
-        for line in TextLine::all(path, &read_text(path)?).filter(|l| !l.words.is_empty()) {
+    fn read_text_points(&mut self, text: &str) -> anyhow::Result<()> {
+        for line in TextLine::all(text).filter(|line| !line.words.is_empty()) {
             let id = line.number(0, "point id")?;
             let [x, y, z] = [line.number(1, "x")?, line.number(2, "y")?, line.number(3, "z")?];
             self.points.insert(id, DVec3::new(x, y, z));
@@ -218,12 +218,11 @@ impl Model {
     }
 
     /// Creates the frame of an image, without its name; `file` is its photograph.
-    pub(super) fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, Reason> {
+    pub(super) fn frame(&self, image: &Image, file: PathBuf) -> anyhow::Result<Frame> {
         let id = image.camera;
-        let camera = self.cameras.get(&id);
-        let camera = camera.ok_or_else(|| Reason::new(format!("camera {id} not found")))?;
-        let fitted = fit_camera(*camera, read_header(&file)?)
-            .map_err(|reason| Reason::new(format!("{reason} (camera {id})")))?;
+        let camera = self.cameras.get(&id).with_context(|| format!("camera {id} not found"))?;
+        let fitted =
+            fit_camera(*camera, read_header(&file)?).with_context(|| format!("camera {id}"))?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
         let mut frame = Frame::new(file, fitted, camera_to_world);
         frame.depth_range = depth_range(image, camera, &self.points);
@@ -233,19 +232,19 @@ impl Model {
 }
 
 /// Returns the rotation matrix of a quaternion (w, x, y, z) of any positive length.
-fn rotation_matrix([w, x, y, z]: [f64; 4]) -> Result<DMat3, Reason> {
+fn rotation_matrix([w, x, y, z]: [f64; 4]) -> anyhow::Result<DMat3> {
     let quaternion = DQuat::from_xyzw(x, y, z, w);
     let length = quaternion.length();
-    if !(length.is_finite() && length > 1e-9) {
-        let numbers = [w, x, y, z].map(format_number).join(", ");
-        return Err(Reason::new(format!("({numbers}) is not a rotation quaternion")));
-    }
+    ensure!(
+        length.is_finite() && length > 1e-9,
+        "({}) is not a rotation quaternion",
+        [w, x, y, z].map(format_number).join(", ")
+    );
     Ok(DMat3::from_quat(quaternion * (1.0 / length)))
 }
 
 /// Line of a text file.
 struct TextLine<'a> {
-    path: &'a Path,
     /// Line number, counted from 1.
     number: usize,
     text: &'a str,
@@ -254,18 +253,17 @@ struct TextLine<'a> {
 
 impl<'a> TextLine<'a> {
     /// Returns the lines of a text without comments.
-    fn all(path: &'a Path, text: &'a str) -> impl Iterator<Item = Self> {
+    fn all(text: &'a str) -> impl Iterator<Item = Self> {
         let lines = text.lines().enumerate().filter(|(_, line)| !line.starts_with('#'));
-        lines.map(move |(i, line)| Self {
-            path,
+        lines.map(|(i, line)| Self {
             number: i + 1,
             text: line,
             words: line.split_whitespace().collect(),
         })
     }
 
-    fn error(&self, reason: impl Display) -> DatasetError {
-        DatasetError::format(self.path, Reason::new(format!("line {}: {reason}", self.number)))
+    fn error(&self, reason: impl Display) -> anyhow::Error {
+        anyhow!("line {}: {reason}", self.number)
     }
 
     /// Returns the rest of the line after a number of words: a file name, which may have spaces.
@@ -291,10 +289,8 @@ impl<'a> TextLine<'a> {
     }
 
     /// Parses the word with an index; `what` describes it in errors.
-    fn number<T: std::str::FromStr>(&self, index: usize, what: &str) -> Result<T, DatasetError> {
-        let Some(word) = self.words.get(index) else {
-            return Err(self.error(format!("{what} is missing")));
-        };
+    fn number<T: std::str::FromStr>(&self, index: usize, what: &str) -> anyhow::Result<T> {
+        let word = self.words.get(index).ok_or_else(|| self.error(format!("{what} is missing")))?;
         word.parse()
             .map_err(|_| self.error(format!("{what}: {:?} is not a valid number", shortened(word))))
     }

@@ -201,7 +201,7 @@ fn the_largest_model_is_read_and_reported() {
     assert!(set.notes[1].contains("sparse/0 has 1, sparse/1 has 2"), "{:?}", set.notes);
 }
 
-fn read_texts(cameras: &str, images: &str) -> Result<Dataset, DatasetError> {
+fn read_texts(cameras: &str, images: &str) -> Result<Dataset, crate::DatasetError> {
     Dataset::read(folder("sparse/0", &text_files(cameras, images, POINTS)).path())
 }
 
@@ -219,7 +219,7 @@ fn mistakes_are_named() {
         ("80 60 70 40", "0 60 70 40", "image size 0×60 is invalid"),
         ("80 60 70 40", "80 80 70 40", "aspect ratios must match"),
         ("70 40 30 -0.1", "nan 40 30 -0.1", "fx is NaN"),
-        ("30 -0.1", "30 inf", "lens distortion (k1 inf,"),
+        ("30 -0.1", "30 inf", "lens distortion (k1 inf)"),
         ("70 40 30", "70 x 30", "line 2: parameter: \"x\""),
     ] {
         let message = read_texts(&CAMERAS.replace(from, to), IMAGES).unwrap_err().to_string();
@@ -281,7 +281,7 @@ fn unknown_model_numbers_are_named() {
     );
 }
 
-fn read_binaries(files: &[Vec<u8>; 3]) -> Result<Dataset, DatasetError> {
+fn read_binaries(files: &[Vec<u8>; 3]) -> Result<Dataset, crate::DatasetError> {
     let named = [
         ("cameras.bin", &files[0][..]),
         ("images.bin", &files[1][..]),

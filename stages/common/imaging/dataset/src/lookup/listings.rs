@@ -4,7 +4,7 @@ use std::rc::Rc;
 
 use unicode_normalization::UnicodeNormalization as _;
 
-use crate::file_status::{FileStatus, file_status};
+use crate::file_status::check_file;
 
 /// Names in a folder, grouped by [`folded`] form.
 type Names = BTreeMap<String, Vec<String>>;
@@ -38,7 +38,7 @@ impl Listings {
     }
 
     pub(crate) fn is_file(&self, path: &Path) -> bool {
-        matches!(file_status(&self.root.join(path), "a file"), FileStatus::File)
+        check_file(&self.root.join(path), "a file").is_ok()
     }
 
     pub(crate) fn is_folder(&self, path: &Path) -> bool {

@@ -17,23 +17,29 @@ use std::path::{Path, PathBuf};
 
 use artifact::{PathError, relative_path};
 
-use crate::file_status::{FileProblem, FileStatus, file_status, path_text};
+use crate::file_status::{FileProblem, check_file, path_text};
 use crate::photograph::is_image_name;
 use crate::unsupported::is_unsupported_name;
 
 pub(crate) use listings::Listings;
-use matching::{Extensions, Tolerance, absolute_parts, candidates, parts};
-use steps::{Steps, StepsTaken};
+use matching::{Tolerance, absolute_parts, candidates, inside_parts};
+use steps::{Step, Steps};
 
 /// Folder of photographs in most formats; reduced copies are in `images_2`, `images_4` and so on.
 const IMAGES: &str = "images";
 
 /// Error returned when a name doesn't determine a single file inside the folder.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, thiserror::Error)]
 pub(crate) enum LookupError {
     /// Path out of the folder, or an empty name.
-    #[error(transparent)]
+    #[error(
+        "{0}; name a file in the folder, or move the list of names to the folder above, and give \
+        that folder"
+    )]
     Path(#[from] PathError),
+    /// Name of no file, or of something that can't be read as a file.
+    #[error("{0}; restore or rename the file, or remove its entry")]
+    File(#[from] FileProblem),
     /// Name that two files match equally well; both paths are relative to the data set's folder.
     #[error(
         "{} and {} both match {name:?}; remove one of the two, or name it exactly",
@@ -43,13 +49,11 @@ pub(crate) enum LookupError {
     Ambiguous { name: String, first: PathBuf, second: PathBuf },
 }
 
-/// Result of a lookup.
-#[derive(Debug)]
-pub(crate) enum Located {
-    File(LocatedFile),
-    Missing(FileProblem),
-    /// Something that can't be read as a file.
-    Unusable(FileProblem),
+impl LookupError {
+    /// True if no file has the name.
+    pub(crate) fn is_missing(&self) -> bool {
+        matches!(self, Self::File(FileProblem::Missing(_)))
+    }
 }
 
 /// File found for a name. Both paths are relative to the data set's folder.
@@ -60,40 +64,27 @@ pub(crate) struct LocatedFile {
     pub(crate) label: PathBuf,
 }
 
-/// Treatment of files that other names match literally.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum ClaimedFiles {
-    /// Claimed files are not found by tolerance.
-    Excluded,
-    /// Claimed files are also found by tolerance.
-    Included,
-}
-
-/// Names that may lose leading folders.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum ShortenedNames {
-    Absolute,
-    All,
-}
-
-impl ShortenedNames {
-    /// Returns the parts of a name that may lose the first ones.
-    fn parts(self, name: &str) -> Option<Vec<&str>> {
-        match self {
-            Self::Absolute => absolute_parts(name),
-            Self::All => {
-                let parts = parts(name);
-                (!parts.is_empty() && !parts.contains(&"..")).then_some(parts)
-            }
-        }
+impl From<PathBuf> for LocatedFile {
+    fn from(path: PathBuf) -> Self {
+        Self { label: path.clone(), path }
     }
 }
+
+/// Function that splits names that may lose leading folders; `None` for other names.
+type SplitName = fn(&str) -> Option<Vec<&str>>;
 
 /// Interpretation of a name as a path.
 struct Interpretation {
     path: PathBuf,
-    taken: StepsTaken,
-    extensions: Extensions,
+    /// Steps that lead to the path.
+    steps: Vec<Step>,
+}
+
+impl Interpretation {
+    /// True if the file may have any image extension: reduced copies often have another format.
+    fn has_any_extension(&self) -> bool {
+        self.steps.contains(&Step::Substitute)
+    }
 }
 
 /// Lookup of a data set's names.
@@ -101,8 +92,8 @@ pub(crate) struct Lookup {
     listings: Listings,
     /// Folder that names are relative to, inside the data set's folder.
     base: PathBuf,
-    /// Names that lose leading parts.
-    shortened: ShortenedNames,
+    /// Function that splits the names that lose leading parts.
+    split_name: SplitName,
     /// Number of leading parts that such names lose; `None` if no tail is a file.
     removed: Option<usize>,
     /// Folder `images_N` that is read instead of a missing `images`.
@@ -121,8 +112,8 @@ impl Lookup {
         let mut lookup = Self::new(folder, PathBuf::new(), names);
         lookup.is_png_implied = true;
         let names = [names, repeated].concat();
-        if !lookup.choose_removed_and_substitute(&names, ShortenedNames::Absolute) {
-            lookup.choose_removed_and_substitute(&names, ShortenedNames::All);
+        if !lookup.choose_removed_and_substitute(&names, absolute_parts) {
+            lookup.choose_removed_and_substitute(&names, inside_parts);
         }
         lookup
     }
@@ -132,11 +123,11 @@ impl Lookup {
     pub(crate) fn in_images(folder: &Path, names: &[&str]) -> Self {
         let mut inside = Self::new(folder, PathBuf::from(IMAGES), names);
         let mut outside = Self::new(folder, PathBuf::new(), names);
-        for shortened in [ShortenedNames::Absolute, ShortenedNames::All] {
-            if inside.choose_removed_and_substitute(names, shortened) {
+        for split_name in [absolute_parts as SplitName, inside_parts] {
+            if inside.choose_removed_and_substitute(names, split_name) {
                 return inside;
             }
-            if outside.choose_removed_and_substitute(names, shortened) {
+            if outside.choose_removed_and_substitute(names, split_name) {
                 return outside;
             }
         }
@@ -149,7 +140,7 @@ impl Lookup {
         Self {
             listings: Listings::new(folder),
             base,
-            shortened: ShortenedNames::Absolute,
+            split_name: absolute_parts,
             removed: None,
             substitute: None,
             is_png_implied: false,
@@ -165,10 +156,8 @@ impl Lookup {
 
     /// Returns the folder that names are relative to.
     pub(crate) fn base(&self) -> PathBuf {
-        if self.base.as_os_str().is_empty() {
-            return self.root().to_path_buf();
-        }
-        self.root().join(&self.base)
+        // Collecting removes the slash that `join` adds before an empty path.
+        self.root().join(&self.base).components().collect()
     }
 
     /// Returns a path of the data set relative to the folder of photographs.
@@ -184,40 +173,38 @@ impl Lookup {
     }
 
     /// Finds the file of a name, and records the steps that led there.
-    pub(crate) fn find(&mut self, name: &str) -> Result<Located, LookupError> {
-        self.locate(name, ClaimedFiles::Excluded)
+    pub(crate) fn find(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
+        self.locate(name, false)
     }
 
     /// Finds the file of a name in a list that repeats names, which another name may have claimed.
-    pub(crate) fn find_repeated(&mut self, name: &str) -> Result<Located, LookupError> {
-        self.locate(name, ClaimedFiles::Included)
+    pub(crate) fn find_repeated(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
+        self.locate(name, true)
     }
 
-    fn locate(&mut self, name: &str, claimed: ClaimedFiles) -> Result<Located, LookupError> {
+    /// Finds the file of a name; one that another name matches literally only if `may_be_claimed`.
+    fn locate(&mut self, name: &str, may_be_claimed: bool) -> Result<LocatedFile, LookupError> {
         let literal = self.literal_path(name);
         let mut missing = None;
         if let Ok(path) = &literal {
-            match file_status(&self.root().join(path), "an image") {
-                FileStatus::File if is_image_name(Path::new(name)) => {
-                    let (path, label) = (path.clone(), path.clone());
-                    return Ok(Located::File(LocatedFile { path, label }));
-                }
-                FileStatus::File => {}
-                FileStatus::Missing(problem) => missing = Some(problem),
-                FileStatus::Unusable(problem) => return Ok(Located::Unusable(problem)),
+            match check_file(&self.root().join(path), "an image") {
+                Ok(()) if is_image_name(Path::new(name)) => return Ok(path.clone().into()),
+                Ok(()) => {}
+                Err(problem @ FileProblem::Missing(_)) => missing = Some(problem),
+                Err(problem) => return Err(problem.into()),
             }
         }
-        if let Some((file, taken)) = self.search(name, claimed)? {
-            self.steps.record(name, &file.path, taken);
-            return Ok(Located::File(file));
+        if let Some((file, steps)) = self.search(name, may_be_claimed)? {
+            self.steps.record(name, &file.path, steps);
+            return Ok(file);
         }
         if let Some(path) = self.unsupported_file(name) {
-            return Ok(Located::File(LocatedFile { label: path.clone(), path }));
+            return Ok(path.into());
         }
         match (missing, literal) {
-            (Some(problem), _) => Ok(Located::Missing(problem)),
+            (Some(problem), _) => Err(problem.into()),
             (None, Err(error)) if absolute_parts(name).is_none() => Err(error.into()),
-            _ => Ok(Located::Missing(FileProblem::Other(format!(
+            _ => Err(LookupError::File(FileProblem::Missing(format!(
                 "no file in the data set matches the end of the absolute path {}",
                 path_text(Path::new(name))
             )))),
@@ -249,12 +236,12 @@ impl Lookup {
     fn search(
         &mut self,
         name: &str,
-        claimed: ClaimedFiles,
-    ) -> Result<Option<(LocatedFile, StepsTaken)>, LookupError> {
+        may_be_claimed: bool,
+    ) -> Result<Option<(LocatedFile, Vec<Step>)>, LookupError> {
         let interpretations = self.interpretations(name);
-        for tolerance in Tolerance::STEPS {
+        for tolerance in Tolerance::all() {
             for interpretation in &interpretations {
-                match &self.matches(interpretation, tolerance, claimed)[..] {
+                match &self.matches(interpretation, tolerance, may_be_claimed)[..] {
                     [] => {}
                     [file] => return Ok(Some(self.located(interpretation, tolerance, file))),
                     [first, second, ..] => {
@@ -272,51 +259,42 @@ impl Lookup {
 
     /// Returns the interpretations of a name, the most literal first.
     fn interpretations(&self, name: &str) -> Vec<Interpretation> {
-        let none = StepsTaken::default();
+        let mut paths = vec![(relative_path(name), Vec::new())];
+        if name.contains('\\') {
+            paths.push((relative_path(&name.replace('\\', "/")), vec![Step::Slashes]));
+        }
+        if let (Some(parts), Some(removed)) = ((self.split_name)(name), self.removed) {
+            let tail = parts[removed.min(parts.len())..].join("/");
+            paths.push((relative_path(&tail), vec![Step::Tail]));
+        }
         let mut found = Vec::new();
-        if let Ok(path) = relative_path(name) {
-            found.push(self.interpretation(&path, none));
-        }
-        if name.contains('\\')
-            && let Ok(path) = relative_path(&name.replace('\\', "/"))
-        {
-            found.push(self.interpretation(&path, StepsTaken { slashes: true, ..none }));
-        }
-        if let (Some(parts), Some(removed)) = (self.shortened.parts(name), self.removed)
-            && let Ok(path) = relative_path(&parts[removed.min(parts.len())..].join("/"))
-        {
-            found.push(self.interpretation(&path, StepsTaken { tail: true, ..none }));
+        for (path, mut steps) in paths {
+            let Ok(path) = path else { continue };
+            let mut path = self.base.join(path);
+            if let (Some(substitute), Ok(inside)) = (&self.substitute, path.strip_prefix(IMAGES)) {
+                path = Path::new(substitute).join(inside);
+                steps.push(Step::Substitute);
+            }
+            found.push(Interpretation { path, steps });
         }
         found
-    }
-
-    fn interpretation(&self, path: &Path, taken: StepsTaken) -> Interpretation {
-        let path = self.base.join(path);
-        match (&self.substitute, path.strip_prefix(IMAGES)) {
-            (Some(substitute), Ok(inside)) => Interpretation {
-                path: Path::new(substitute).join(inside),
-                taken: StepsTaken { substitute: true, ..taken },
-                extensions: Extensions::Any,
-            },
-            _ => Interpretation { path, taken, extensions: Extensions::Similar },
-        }
     }
 
     fn matches(
         &mut self,
         interpretation: &Interpretation,
         tolerance: Tolerance,
-        claimed: ClaimedFiles,
+        may_be_claimed: bool,
     ) -> Vec<PathBuf> {
-        let Interpretation { path, extensions, .. } = interpretation;
-        let mut files = candidates(&mut self.listings, path, tolerance, *extensions);
+        let (path, any_extension) = (&interpretation.path, interpretation.has_any_extension());
+        let mut files = candidates(&mut self.listings, path, tolerance, any_extension);
         // A converted copy of an unsupported file is preferred to the file itself.
         if tolerance == Tolerance::NONE && !files.is_empty() && is_unsupported_name(path) {
             let converted = Tolerance { extension: true, ..tolerance };
-            let found = candidates(&mut self.listings, path, converted, *extensions);
+            let found = candidates(&mut self.listings, path, converted, any_extension);
             files = if found.is_empty() { files } else { found };
         }
-        if tolerance != Tolerance::NONE && claimed == ClaimedFiles::Excluded {
+        if tolerance != Tolerance::NONE && !may_be_claimed {
             files.retain(|file| !self.claimed.contains(file));
         }
         files
@@ -329,8 +307,8 @@ impl Lookup {
         interpretation: &Interpretation,
         tolerance: Tolerance,
         file: &Path,
-    ) -> (LocatedFile, StepsTaken) {
-        let Interpretation { path, taken, extensions } = interpretation;
+    ) -> (LocatedFile, Vec<Step>) {
+        let path = &interpretation.path;
         let shorter = file.with_extension("");
         let is_implied = self.is_png_implied
             && !has_image_extension(path)
@@ -338,28 +316,31 @@ impl Lookup {
             && file.extension().is_some_and(|extension| extension == "png");
         let is_exact = !tolerance.form && !tolerance.case;
         let is_renamed = tolerance.extension || is_exact && file != path;
-        let extension = is_renamed && !is_implied && *extensions == Extensions::Similar;
+        let extension = is_renamed && !is_implied && !interpretation.has_any_extension();
         let is_doubled = extension && is_image_name(path) && is_image_name(&shorter);
         let label = if is_doubled { shorter } else { file.to_path_buf() };
-        let Tolerance { form, case, .. } = tolerance;
-        let taken = StepsTaken { extension, form, case, ..*taken };
-        (LocatedFile { path: file.to_path_buf(), label }, taken)
+        let mut steps = interpretation.steps.clone();
+        for (is_taken, step) in [
+            (extension, Step::Extension),
+            (tolerance.form, Step::Form),
+            (tolerance.case, Step::Case),
+        ] {
+            steps.extend(is_taken.then_some(step));
+        }
+        (LocatedFile { path: file.to_path_buf(), label }, steps)
     }
 
     /// Chooses the number of parts to remove from names and the substitute for a missing `images`,
     /// so that most names are found. Longer tails and larger copies are preferred. Returns whether
     /// at least one name is found.
-    fn choose_removed_and_substitute(&mut self, names: &[&str], shortened: ShortenedNames) -> bool {
-        self.shortened = shortened;
-        let longest = names.iter().filter_map(|name| shortened.parts(name)).map(|p| p.len()).max();
+    fn choose_removed_and_substitute(&mut self, names: &[&str], split_name: SplitName) -> bool {
+        self.split_name = split_name;
+        let longest = names.iter().filter_map(|name| split_name(name)).map(|p| p.len()).max();
         let removals: Vec<Option<usize>> = match longest {
             Some(parts) => (0..parts).map(Some).collect(),
             None => vec![None],
         };
         let substitutes = self.substitutes();
-        if longest.is_none() && substitutes.len() == 1 {
-            return names.iter().any(|name| self.has_file(name));
-        }
         let mut best = (0, None, None);
         for removed in &removals {
             for substitute in &substitutes {
@@ -393,7 +374,7 @@ impl Lookup {
 
     /// True if at least one file matches a name.
     fn has_file(&mut self, name: &str) -> bool {
-        !matches!(self.search(name, ClaimedFiles::Included), Ok(None))
+        !matches!(self.search(name, true), Ok(None))
     }
 }
 

@@ -14,8 +14,7 @@ fn folder(files: &[&str]) -> tempfile::TempDir {
 /// Returns the path of the file with the given name, or the error message.
 fn find(lookup: &mut Lookup, name: &str) -> String {
     match lookup.find(name) {
-        Ok(Located::File(file)) => path_text(&file.path),
-        Ok(Located::Missing(problem) | Located::Unusable(problem)) => problem.to_string(),
+        Ok(file) => path_text(&file.path),
         Err(error) => error.to_string(),
     }
 }
@@ -92,7 +91,7 @@ fn steps_are_tried_in_order_and_combine() {
         ("images/A.png", "images/a.png", "images/A.png not found"),
     ] {
         let mut lookup = Lookup::in_folder(dir.path(), &[name, other], &[]);
-        assert!(find(&mut lookup, name).ends_with(file), "{name}");
+        assert!(find(&mut lookup, name).contains(file), "{name}");
         assert_eq!(find(&mut lookup, other), other);
     }
 }
@@ -152,7 +151,7 @@ fn relative_names_lose_leading_folders_where_none_is_found() {
         assert!(notes.contains(&first), "{notes}");
     }
     let mut lookup = Lookup::in_folder(dir.path(), &["images/a.png", "new/b.png"], &[]);
-    assert!(find(&mut lookup, "new/b.png").ends_with("new/b.png not found"));
+    assert!(find(&mut lookup, "new/b.png").contains("new/b.png not found"));
     let mut lookup = Lookup::in_images(dir.path(), &["DCIM/100/a.png", "DCIM/100/b.png"]);
     assert_eq!(find(&mut lookup, "DCIM/100/b.png"), "images/b.png");
     let mut lookup = Lookup::in_folder(dir.path(), &["../images/a.png"], &[]);

@@ -137,7 +137,7 @@ fn a_jpeg_that_is_cut_is_refused() {
         ),
         (&bytes[..bytes.len() - 9], "a.jpg: cut short or damaged: 16 of 64 rows are missing;"),
         (&bytes[..100], "a.jpg: cut short or damaged: 64 of 64 rows are missing; export"),
-        (&bytes[..20], "a.jpg: cannot read its header (Format error"),
+        (&bytes[..20], "a.jpg: damaged JPEG: headers and image data don't match; export"),
         (&progressive[..progressive.len() - 1], "detail of all 64 rows is missing; export"),
         (&hidden_jpeg(), "a.jpg: damaged JPEG: headers and image data don't match; export"),
     ] {
