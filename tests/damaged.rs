@@ -143,7 +143,10 @@ const DAMAGES: &[Damage] = &[
     ),
     (
         |data| edit_training(data, |list| list["frames"][1]["fl_x"] = json!("y".repeat(5_000_000))),
-        &["transforms_train.json: frame 1 (./train/r_1): fl_x: expected a number, found \"yyy", "y…"],
+        &[
+            "transforms_train.json: frame 1 (./train/r_1): fl_x: expected a number, found \"yyy",
+            "y…",
+        ],
     ),
     (
         |data| {

@@ -54,7 +54,10 @@ fn names_from_files_are_printed_without_control_characters() {
     let missing = project.run(&["run"]);
     missing.fails(
         3,
-        &[r"frame 1 (./train/\u{1b}]0;PWN\u{7}\u{1b}[31m\nred)", "not found; restore or rename the file"],
+        &[
+            r"frame 1 (./train/\u{1b}]0;PWN\u{7}\u{1b}[31m\nred)",
+            "not found; restore or rename the file",
+        ],
     );
     assert!(is_plain(&missing.stderr) && is_plain(&missing.stdout), "{}", missing.stderr);
     // The image may have this name; its view's name has no control characters.

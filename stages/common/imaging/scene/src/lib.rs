@@ -48,5 +48,5 @@ pub use pose::{Pose, looking_at, pose_of, without_scale};
 pub use projection::Projection;
 pub use space::{Frustum, Space, power_of_two_floor};
 pub use view_image::{VIEW_CHANNELS, image_file, mask_file, preview_file, write_view_image};
-pub use views::{Background, Conventions, Photograph, VIEWS_FILE, View, Views};
+pub use views::{Background, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
 pub use warp::{PointProjection, SurfaceMap};

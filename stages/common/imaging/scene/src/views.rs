@@ -1,7 +1,6 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use anyhow::{anyhow, ensure};
 use artifact::{Failure, FailureExt as _, GivenInput, relative_path};
 use pixels::{Image, Mask, PixelError, read_png, read_premultiplied};
 use schemars::JsonSchema;
@@ -176,6 +175,11 @@ impl Background {
     }
 }
 
+/// Error returned when `views.json` is invalid.
+#[derive(Debug, thiserror::Error)]
+#[error("{VIEWS_FILE}: {0}")]
+pub struct ViewsError(String);
+
 impl Views {
     /// Creates a list of views with the current conventions.
     pub fn new(background: Background, bounds: Bounds, views: Vec<View>) -> Self {
@@ -219,31 +223,34 @@ impl Views {
 
     /// Fails for an empty list, invalid cameras, names or paths that leave the folder, and empty
     /// bounds.
-    pub fn check(&self) -> anyhow::Result<()> {
-        ensure!(!self.views.is_empty(), "{VIEWS_FILE}: no views found");
-        ensure!(
-            self.bounds.is_valid(),
-            "{VIEWS_FILE}: bounds {:?} are empty or not finite",
-            self.bounds
-        );
+    pub fn check(&self) -> Result<(), ViewsError> {
+        let refused = |problem| Err(ViewsError(problem));
+        if self.views.is_empty() {
+            return refused("no views found".to_owned());
+        }
+        if !self.bounds.is_valid() {
+            return refused(format!("bounds {:?} are empty or not finite", self.bounds));
+        }
         let mut names = BTreeSet::new();
         for view in &self.views {
             let name = &view.camera.name;
             let is_plain = relative_path(name).is_ok_and(|p| p.components().count() == 1)
                 && !name.contains(char::is_control);
-            ensure!(
-                is_plain && names.insert(name),
-                "{VIEWS_FILE}: view name {name:?} is used twice or can't name a file"
-            );
-            view.camera.check().map_err(|error| anyhow!("{VIEWS_FILE}: view {name:?}: {error}"))?;
+            if !is_plain || !names.insert(name) {
+                return refused(format!("view name {name:?} is used twice or can't name a file"));
+            }
+            if let Err(error) = view.camera.check() {
+                return refused(format!("view {name:?}: {error}"));
+            }
             let View { image, mask, depth, low_resolution, .. } = view;
             for path in [image, mask, depth, low_resolution].into_iter().flatten() {
-                relative_path(path).map_err(|error| anyhow!("{VIEWS_FILE}: {error}"))?;
+                if let Err(error) = relative_path(path) {
+                    return refused(error.to_string());
+                }
                 // A terminal would interpret control characters.
-                ensure!(
-                    !path.contains(char::is_control),
-                    "{VIEWS_FILE}: {path:?} has control characters"
-                );
+                if path.contains(char::is_control) {
+                    return refused(format!("{path:?} has control characters"));
+                }
             }
         }
         Ok(())
