@@ -38,7 +38,7 @@ mod scale;
 mod tables;
 mod unscored;
 
-use artifact::{Failure, RunRecord, bail_usage, format_count, format_size};
+use artifact::{RunRecord, bail_usage, format_count, format_size};
 use stage::{Context, Input, Output, Stage};
 
 pub use data::Params;
@@ -76,7 +76,7 @@ impl Stage for Report {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        run.check()?;
         if let Some([.., 0]) = params.crop {
             bail_usage!("parameter crop: expected a side of at least 1 pixel, found 0");
         }

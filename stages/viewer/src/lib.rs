@@ -94,7 +94,7 @@ impl Stage for Viewer {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        run.check()?;
         let is_shown_field = |i: &usize| run.nodes[*i].is_shown && run.nodes[*i].kind == "field";
         let indices: Vec<usize> = (0..run.nodes.len()).filter(is_shown_field).collect();
         let fields: Vec<&RunNode> = indices.iter().map(|&i| &run.nodes[i]).collect();

@@ -45,7 +45,7 @@ pub use listing::{
 };
 pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_file};
 pub use run_record::{
-    FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, label, sink_folders,
+    FailedPoint, RunInput, RunNode, RunRecord, UnfinishedNode, label, sink_folders,
 };
 pub use text::{
     WARNING, format_amount, format_count, format_duration, format_number, format_size, format_utc,
