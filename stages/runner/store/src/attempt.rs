@@ -4,8 +4,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 
 use artifact::{
-    MANIFEST_FILE, Manifest, OutputFileError, hash_json, list_output_files, write_json,
-    write_json_atomically,
+    MANIFEST_FILE, Manifest, hash_json, list_output_files, write_json, write_json_atomically,
 };
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -75,10 +74,8 @@ impl Attempt {
     /// Replaces hard links by copies, since writing to a file by its other name would change the
     /// artifact. Fails if there is anything other than folders and regular files.
     fn copy_hard_links(&self) -> Result<(), StoreError> {
-        let files = list_output_files(&self.output).map_err(|problem| match problem {
-            OutputFileError::Kind { .. } => StoreError::NoArtifact(problem.to_string()),
-            OutputFileError::Io(source) => StoreError::Io { path: self.output.clone(), source },
-        })?;
+        let files = list_output_files(&self.output)
+            .map_err(|problem| StoreError::NoArtifact(problem.to_string()))?;
         let copy = self.folder.join("copy");
         for (file, metadata) in files {
             if metadata.nlink() > 1 {

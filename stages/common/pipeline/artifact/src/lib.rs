@@ -40,8 +40,8 @@ pub use fsio::{
 };
 pub use given_input::GivenInput;
 pub use listing::{
-    ListedFiles, OutputFileError, PathError, file_kind, is_ignored_name, list_files,
-    list_output_files, list_source_files, relative_path,
+    ListedFiles, PathError, file_kind, is_ignored_name, list_files, list_output_files,
+    list_source_files, relative_path,
 };
 pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_file};
 pub use run_record::{
