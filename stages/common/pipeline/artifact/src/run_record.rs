@@ -172,7 +172,10 @@ impl RunRecord {
         for (index, node) in self.nodes.iter().enumerate() {
             for (name, input) in &node.inputs {
                 if input.node.is_some_and(|parent| parent >= index) {
-                    bail_bad_input!("run.json: {}, input {name}, requires a later node", node.stage);
+                    bail_bad_input!(
+                        "run.json: {}, input {name}, requires a later node",
+                        node.stage
+                    );
                 }
             }
         }

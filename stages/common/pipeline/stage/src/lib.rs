@@ -80,7 +80,7 @@ pub use memory::{
     remaining_memory,
 };
 pub use panics::install_panic_hook;
-pub use processors::{ProcessorLimit, Processors, processors, start_threads};
+pub use processors::{ALL_PROCESSORS, Processors, processors, start_threads};
 pub use progress::{Event, Pace, Progress, ProgressMode, join_parts};
 pub use run::{RUNNER_VARIABLE, run_stage};
 pub use signals::{stop_on_signals, stop_signals};
