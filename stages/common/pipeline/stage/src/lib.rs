@@ -66,7 +66,7 @@ mod stage;
 mod staging;
 mod training;
 
-pub use arguments::{DeviceError, check_device};
+pub use arguments::check_device;
 pub use checkpoint_schedule::CheckpointSchedule;
 pub use context::{Context, SUMMARY_FILE};
 pub use contract::{
