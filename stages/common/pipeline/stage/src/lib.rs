@@ -46,7 +46,6 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod arguments;
-mod checkpoint_schedule;
 mod context;
 mod contract;
 mod help;
@@ -67,7 +66,6 @@ mod staging;
 mod training;
 
 pub use arguments::check_device;
-pub use checkpoint_schedule::CheckpointSchedule;
 pub use context::{Context, SUMMARY_FILE};
 pub use contract::{
     ContractError, Description, GivenInputs, Input, Output, PARAMETER_GROUPS, ParameterDoc,
@@ -85,4 +83,4 @@ pub use progress::{Event, Pace, Progress, ProgressMode, join_parts};
 pub use run::{RUNNER_VARIABLE, run_stage};
 pub use signals::{stop_on_signals, stop_signals};
 pub use stage::Stage;
-pub use training::Training;
+pub use training::{CheckpointSchedule, Training};
