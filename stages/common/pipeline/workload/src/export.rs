@@ -11,25 +11,16 @@ pub const SURFACE_PIXEL_BYTES: u64 = 24;
 /// Bytes of a sample that is merged to a surfel.
 pub const SURFEL_SAMPLE_BYTES: u64 = 20;
 
-/// Views from which `export` derives surfaces.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ExportViews {
-    /// Number of pixels of all views.
-    pub pixels: u64,
+/// Returns the size of the views that `export` renders without a given width, relative to cameras
+/// with `camera_pixels` in all.
+pub fn export_scale(camera_pixels: u64) -> f64 {
+    (MAX_PIXELS / camera_pixels as f64).sqrt().min(MAX_SCALE)
 }
 
-impl ExportViews {
-    /// Returns the size of rendered views without a given width, relative to cameras with
-    /// `camera_pixels` in all.
-    pub fn default_scale(camera_pixels: u64) -> f64 {
-        (MAX_PIXELS / camera_pixels as f64).sqrt().min(MAX_SCALE)
-    }
-
-    /// Returns the peak memory: all pixels, and the larger of the merged samples and the lattice of
-    /// a mesh.
-    pub fn bytes(&self, lattice_nodes: u64) -> u64 {
-        // Two copies of each sample exist while samples are collected.
-        let merged = 2 * SURFEL_SAMPLE_BYTES * self.pixels;
-        SURFACE_PIXEL_BYTES * self.pixels + merged.max(BYTES_PER_NODE * lattice_nodes)
-    }
+/// Returns the peak memory of an export whose views have `pixels` in all: all pixels, and the
+/// larger of the merged samples and the lattice of a mesh.
+pub fn export_bytes(pixels: u64, lattice_nodes: u64) -> u64 {
+    // Two copies of each sample exist while samples are collected.
+    let merged = 2 * SURFEL_SAMPLE_BYTES * pixels;
+    SURFACE_PIXEL_BYTES * pixels + merged.max(BYTES_PER_NODE * lattice_nodes)
 }
