@@ -348,7 +348,7 @@ fn are_equal(a: &Value, b: &Value) -> bool {
 }
 
 /// Returns the exact value of a whole number; `None` for fractions.
-fn exact_integer(number: &Number) -> Option<i128> {
+pub(crate) fn exact_integer(number: &Number) -> Option<i128> {
     /// Bound of the floats that are converted: above 64 bits, and within `i128`.
     const LIMIT: f64 = 1e36;
     if let Some(value) = number.as_u64().map(i128::from).or(number.as_i64().map(i128::from)) {

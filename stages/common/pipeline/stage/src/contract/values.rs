@@ -2,7 +2,7 @@
 
 use serde_json::{Number, Value};
 
-use crate::contract::validator::resolve_reference;
+use crate::contract::validator::{exact_integer, resolve_reference};
 
 /// Reader of values by a schema, whose references are resolved in `root`.
 #[derive(Clone, Copy)]
@@ -136,15 +136,8 @@ fn as_float(number: &Number, is_f32: bool) -> Option<Value> {
 
 /// Converts a float to an integer if it is whole and fits into 64 bits.
 fn as_integer(number: &Number) -> Option<Value> {
-    if !number.is_f64() {
-        return None;
-    }
-    let value = number.as_f64()?;
-    const LIMIT: f64 = 18_446_744_073_709_551_616.0; // 2^64
-    if value.fract() != 0.0 || !(-LIMIT / 2.0..LIMIT).contains(&value) {
-        return None;
-    }
-    Some(if value < 0.0 { Value::from(value as i64) } else { Value::from(value as u64) })
+    let value = exact_integer(number).filter(|_| number.is_f64())?;
+    u64::try_from(value).map(Value::from).or_else(|_| i64::try_from(value).map(Value::from)).ok()
 }
 
 /// Converts a number with the suffix k, M or G, such as `1.5M`; `None` if the result isn't whole.
