@@ -73,7 +73,7 @@ impl Source {
         let mut notice = NOTICE_AFTER;
         loop {
             match receiver.recv_timeout(POLL_INTERVAL) {
-                Ok(result) => return result.map_err(|error| error.in_folder(folder)),
+                Ok(result) => return result.map_err(|e| in_folder(folder, e.to_string())),
                 Err(RecvTimeoutError::Disconnected) => return Err(SourceError::Interrupted),
                 Err(RecvTimeoutError::Timeout) => {}
             }
@@ -121,14 +121,15 @@ impl Source {
 
 /// Returns the absolute path of a folder. Fails if the folder doesn't exist or can't be accessed.
 pub(crate) fn check_folder(folder: &Path) -> Result<PathBuf, SourceError> {
-    let error = |problem: String| SourceError::Folder { folder: folder.to_path_buf(), problem };
-    let absolute = folder.canonicalize().map_err(|problem| {
-        error(match problem.kind() {
-            io::ErrorKind::NotFound => "no such folder; name an existing one".to_owned(),
-            _ => format!("{problem}; name another folder"),
-        })
+    let absolute = folder.canonicalize().map_err(|problem| match problem.kind() {
+        io::ErrorKind::NotFound => in_folder(folder, "no such folder; name an existing one"),
+        _ => in_folder(folder, format!("{problem}; name another folder")),
     })?;
-    if absolute.is_dir() { Ok(absolute) } else { Err(error("not a folder".to_owned())) }
+    if absolute.is_dir() { Ok(absolute) } else { Err(in_folder(folder, "not a folder")) }
+}
+
+fn in_folder(folder: &Path, problem: impl Into<String>) -> SourceError {
+    SourceError::Folder { folder: folder.to_path_buf(), problem: problem.into() }
 }
 
 /// Returns the first difference between two maps of files, as text.
@@ -169,30 +170,6 @@ impl HashProgress {
     }
 }
 
-/// Error returned when a folder's files can't be hashed.
-enum ReadError {
-    Unreadable(io::Error),
-    Changed(String),
-}
-
-impl ReadError {
-    fn in_folder(self, folder: &Path) -> SourceError {
-        let problem = match self {
-            Self::Unreadable(problem) => problem.to_string(),
-            Self::Changed(change) => {
-                format!("{change} during hashing; run again when no program writes to the folder")
-            }
-        };
-        SourceError::Folder { folder: folder.to_path_buf(), problem }
-    }
-}
-
-impl From<io::Error> for ReadError {
-    fn from(problem: io::Error) -> Self {
-        Self::Unreadable(problem)
-    }
-}
-
 /// Paths and stamps of files, by path inside a folder.
 type Listing = BTreeMap<String, (PathBuf, Stamp)>;
 
@@ -210,7 +187,7 @@ fn with_path(file: &Path, error: &io::Error) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", file.display()))
 }
 
-fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Source, ReadError> {
+fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> io::Result<Source> {
     let listing = list(folder)?;
     let mut files = cache.files();
     files.retain(|name, file| listing.get(name).is_some_and(|(_, stamp)| *stamp == file.stamp));
@@ -231,7 +208,9 @@ fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Sou
     // The hash of a file that is being written may fit no state of the file.
     let is_same = |before: &(PathBuf, Stamp), now: &(PathBuf, Stamp)| before.1 == now.1;
     if let Some(change) = first_change(&listing, &list(folder)?, is_same) {
-        return Err(ReadError::Changed(change));
+        return Err(io::Error::other(format!(
+            "{change} during hashing; run again when no program writes to the folder"
+        )));
     }
     cache.write(&files);
     Ok(Source { files })
