@@ -4,32 +4,16 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use crate::stage_call::{Interrupted, ProgramError, describe_all};
 use store::Store;
 
+use crate::request::PlanError;
+use crate::stage_call::describe_all;
 use crate::stages::{DescriptionCache, StageProgram, is_own};
 use crate::stamp::Stamp;
 
-/// Error returned when a program differs from the planned one, or can't be compared with it.
-#[derive(Debug, thiserror::Error)]
-pub enum ConfirmError {
-    /// The program's file or its code differs, or can't be read.
-    #[error(transparent)]
-    Program(#[from] ProgramError),
-    /// A signal came while the program was described.
-    #[error("interrupted")]
-    Interrupted,
-}
-
-impl From<Interrupted> for ConfirmError {
-    fn from(_: Interrupted) -> Self {
-        Self::Interrupted
-    }
-}
-
-fn changed(path: &Path) -> ConfirmError {
+fn changed(path: &Path) -> PlanError {
     let problem = "was changed or rebuilt after planning; run again";
-    ProgramError(format!("{} {problem}", path.display())).into()
+    PlanError::Usage(format!("{} {problem}", path.display()))
 }
 
 impl StageProgram {
@@ -40,7 +24,7 @@ impl StageProgram {
 
     /// Checks before a stage's start that the program is the planned one. Returns the file's stamp.
     /// Programs that this one calls are checked after the stage's end.
-    pub fn confirm(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<Stamp, ConfirmError> {
+    pub fn confirm(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<Stamp, PlanError> {
         let now = self.stamp_now()?;
         if self.stamp == Some(now) {
             return Ok(now);
@@ -60,7 +44,7 @@ impl StageProgram {
         start: &Stamp,
         store: &Store,
         stop: Option<&AtomicBool>,
-    ) -> Result<(), ConfirmError> {
+    ) -> Result<(), PlanError> {
         let now = self.stamp_now()?;
         if now == *start && self.is_own() {
             return Ok(());
@@ -69,15 +53,15 @@ impl StageProgram {
         self.check_code(store, stop)
     }
 
-    fn stamp_now(&self) -> Result<Stamp, ConfirmError> {
+    fn stamp_now(&self) -> Result<Stamp, PlanError> {
         let path = self.path.display();
-        Stamp::of(&self.path).map_err(|problem| ProgramError(format!("{path}: {problem}")).into())
+        Stamp::of(&self.path).map_err(|problem| PlanError::Usage(format!("{path}: {problem}")))
     }
 
     /// Fails if a user's file was written to: an interpreter may read a script at any time. The
     /// runner's own programs are in memory after their start, and a build may rewrite their files
     /// without a change of code.
-    fn check_untouched(&self, before: &Stamp, now: &Stamp) -> Result<(), ConfirmError> {
+    fn check_untouched(&self, before: &Stamp, now: &Stamp) -> Result<(), PlanError> {
         if self.is_own() || now.is_untouched_since(before) {
             return Ok(());
         }
@@ -85,10 +69,11 @@ impl StageProgram {
     }
 
     /// Describes the program again. Fails if its code has changed.
-    fn check_code(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<(), ConfirmError> {
+    fn check_code(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<(), PlanError> {
         let path = &self.path;
-        let mut descriptions = describe_all(std::slice::from_ref(path), stop)?;
-        let description = descriptions.remove(path).ok_or(ConfirmError::Interrupted)?;
+        let description = describe_all(std::slice::from_ref(path), stop)
+            .and_then(|mut descriptions| descriptions.remove(path))
+            .ok_or(PlanError::Interrupted)?;
         if description?.code == self.description.code {
             return Ok(());
         }

@@ -52,7 +52,6 @@ mod targets;
 mod yaml_lines;
 
 pub use changes::{Change, changes, short_hash};
-pub use confirm::ConfirmError;
 pub use experiment::{Experiment, Selection, Variant};
 pub use extend::JoinError;
 pub use file::{Part, PipelineError, PipelineFile, StageBlock};

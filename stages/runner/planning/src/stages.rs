@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use crate::stage_call::{Interrupted, ProgramError, describe_all};
 use artifact::{hash_file, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -18,6 +17,8 @@ use store::Store;
 
 use crate::file::{Part, PipelineError, StageBlock};
 use crate::pipeline::Pipeline;
+use crate::request::PlanError;
+use crate::stage_call::{ProgramError, describe_all};
 use crate::stamp::Stamp;
 
 /// Program of a stage, with its description.
@@ -108,7 +109,7 @@ impl Programs {
         store: &Store,
         needed: &BTreeSet<String>,
         describing: Describing,
-    ) -> Result<Self, Interrupted> {
+    ) -> Result<Self, PlanError> {
         let mut cache = DescriptionCache::read(store);
         let mut descriptions: BTreeMap<PathBuf, Result<IdentifiedDescription, ProgramError>> =
             BTreeMap::new();
@@ -140,7 +141,9 @@ impl Programs {
             Describing::OwnOnly => None,
         };
         let unknown_paths: Vec<PathBuf> = unknown.keys().cloned().collect();
-        for (path, description) in describe_all(&unknown_paths, stop)? {
+        for (path, description) in
+            describe_all(&unknown_paths, stop).ok_or(PlanError::Interrupted)?
+        {
             let described = check_unchanged(&path, unknown[&path].clone(), description);
             if let Ok(described) = &described {
                 cache.0.insert(cache_key(&path), described.clone());
