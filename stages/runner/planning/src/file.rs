@@ -202,7 +202,7 @@ impl ParsedFile {
     /// Parses a pipeline file. Fails on duplicate keys, unknown keys and wrong types.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let text = crate::yaml_lines::decode(bytes)
-            .map_err(|e| PipelineError::new(path, e.line, e.problem))?;
+            .map_err(|line| PipelineError::new(path, Some(line), "not UTF-8; save it as UTF-8"))?;
         let content = parse_content(text, path)?;
         let canonical_path = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
         let file =
