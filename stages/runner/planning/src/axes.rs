@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use artifact::known_names;
+use artifact::{known_names, suggestion};
 use serde_json::Value;
 
 use crate::arguments;
@@ -314,13 +314,11 @@ impl Scope<'_> {
     fn unknown_name(&self, kind: Kind, name: &str) -> PlanError {
         let programs = self.pipeline.stages.keys().filter_map(|stage| self.programs.get(stage));
         let known: BTreeSet<&str> = programs.flat_map(|program| kind.names(program)).collect();
-        let suggestion = artifact::nearest(name, known)
-            .map(|known| format!("did you mean {known}? "))
-            .unwrap_or_default();
         let mut problem = format!(
-            "{} {name}: no stage has this {}; {suggestion}see `STAGE --help`",
+            "{} {name}: no stage has this {}; {}see `STAGE --help`",
             kind.flag(),
-            kind.noun()
+            kind.noun(),
+            suggestion(name, known)
         );
         let unusable: Vec<&str> = self.programs.unusable().collect();
         if !unusable.is_empty() {

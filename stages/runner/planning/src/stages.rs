@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use artifact::{hash_file, nearest, write_atomically};
+use artifact::{hash_file, suggestion, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use stage::{Description, Schema};
@@ -316,9 +316,7 @@ fn identify(path: &Path, name: &str) -> Result<FileIdentity, ProgramError> {
     Err(ProgramError(if is_unstamped && name.contains('/') {
         format!("{path}: {error}; set `run:` to the stage's executable")
     } else if is_unstamped && error.kind() == std::io::ErrorKind::NotFound {
-        let suggestion = nearest_program(name)
-            .map(|other| format!("did you mean {other}? "))
-            .unwrap_or_default();
+        let suggestion = suggestion(name, own_programs().iter().map(String::as_str));
         format!(
             "{path} isn't built; {suggestion}run `make build`, or set `run:` to another program"
         )
@@ -327,12 +325,9 @@ fn identify(path: &Path, name: &str) -> Result<FileIdentity, ProgramError> {
     }))
 }
 
-/// Returns the program in the runner's folder whose name is most similar to an unknown name.
-fn nearest_program(name: &str) -> Option<String> {
-    let mut programs = Vec::new();
-    for entry in std::fs::read_dir(runner_folder()).ok()?.flatten() {
-        programs.extend(entry.file_name().into_string().ok().filter(|name| !name.contains('.')));
-    }
-    programs.sort_unstable();
-    nearest(name, programs.iter().map(String::as_str)).map(str::to_owned)
+/// Returns the names of the programs in the runner's folder.
+fn own_programs() -> Vec<String> {
+    let entries = std::fs::read_dir(runner_folder()).into_iter().flatten().flatten();
+    let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
+    names.filter(|name| !name.contains('.')).collect()
 }
