@@ -9,18 +9,6 @@ use crate::pipeline::Pipeline;
 /// Maximum number of files in a chain in which each extends the next, chosen by hand.
 const MAX_CHAINED_FILES: usize = 8;
 
-/// Error returned when two pipelines have different blocks of the same name.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("block {block} differs in {first} and in {second}")]
-pub struct JoinError {
-    /// Name of the block.
-    pub block: String,
-    /// File of the first pipeline's block.
-    pub first: PathBuf,
-    /// File of the second pipeline's block.
-    pub second: PathBuf,
-}
-
 impl Pipeline {
     /// Reads a pipeline file and the files that it extends.
     pub fn read(path: &Path) -> Result<Self, PipelineError> {
@@ -42,17 +30,14 @@ impl Pipeline {
         read_extended(file, &mut chain)
     }
 
-    /// Joins two pipelines. Fails if blocks of the same name differ. Default targets come from
-    /// `self`. If both set the quality, `self` wins. If both set a part of the experiment, `other`
-    /// wins.
-    pub fn joined(mut self, other: Self) -> Result<Self, JoinError> {
+    /// Joins two pipelines. Fails with the problem if blocks of the same name differ. Default
+    /// targets come from `self`. If both set the quality, `self` wins. If both set a part of the
+    /// experiment, `other` wins.
+    pub(crate) fn joined(mut self, other: Self) -> Result<Self, String> {
         let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
         if let Some(name) = shared.find(|name| !self.has_equal_block(&other, name)) {
-            return Err(JoinError {
-                block: name.clone(),
-                first: self.file_of_block(name).path.clone(),
-                second: other.file_of_block(name).path.clone(),
-            });
+            let files = [&self, &other].map(|joined| joined.file_of_block(name).path.display());
+            return Err(format!("block {name} differs in {} and in {}", files[0], files[1]));
         }
         self.stages.extend(other.stages);
         self.experiment.override_with(&other.experiment);

@@ -53,7 +53,6 @@ mod yaml_lines;
 
 pub use changes::{Change, changes, short_hash};
 pub use experiment::{Experiment, Selection, Variant};
-pub use extend::JoinError;
 pub use file::{Part, PipelineError, PipelineFile, StageBlock};
 pub use frozen::FrozenPlan;
 pub use key::{environment_parts, explain, key_parts, nearest_changes, nearest_record};
