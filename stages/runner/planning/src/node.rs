@@ -34,9 +34,9 @@ pub struct Devices {
     pub by_resources: bool,
 }
 
-/// Planned action: a stage at one point of the sweep.
-#[derive(Clone, Debug)]
-pub struct Node {
+/// Planned action: a stage at one point of the sweep. `P` refers to the program.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Node<P = Arc<StageProgram>> {
     /// Name of the stage's block.
     pub stage: String,
     /// Swept values that reach the node, such as `supersample=2`; empty without a sweep. The first
@@ -49,7 +49,7 @@ pub struct Node {
     /// Inputs, sorted by name.
     pub inputs: Vec<NodeInput>,
     /// Program of the stage.
-    pub program: Arc<StageProgram>,
+    pub program: P,
 }
 
 /// Input of a node.
@@ -76,15 +76,17 @@ pub enum Origin {
     Folder(PathBuf),
 }
 
-/// Planned sink: a stage that presents a run.
-pub struct Sink {
+/// Planned sink: a stage that presents a run. `P` refers to the program.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct Sink<P = Arc<StageProgram>> {
     /// Name of the stage's block.
     pub stage: String,
     /// Program of the stage.
-    pub program: Arc<StageProgram>,
+    pub program: P,
     /// All parameters, including defaults.
     pub parameters: Value,
     /// Points to show, each after the points of the stages that it depends on.
+    #[serde(rename = "shows")]
     pub points: Vec<ShownPoint>,
     /// Points that can't be shown because a required file is missing.
     pub left_out: Vec<FailedPoint>,
@@ -116,6 +118,22 @@ pub enum State {
         /// Indices of these nodes.
         on: Vec<usize>,
     },
+}
+
+impl<P> Node<P> {
+    /// Replaces the reference to the program.
+    pub(crate) fn with_program<Q>(self, program: Q) -> Node<Q> {
+        let Self { stage, point, values, parameters, inputs, .. } = self;
+        Node { stage, point, values, parameters, inputs, program }
+    }
+}
+
+impl<P> Sink<P> {
+    /// Replaces the reference to the program.
+    pub(crate) fn with_program<Q>(self, program: Q) -> Sink<Q> {
+        let Self { stage, parameters, points, left_out, .. } = self;
+        Sink { stage, program, parameters, points, left_out }
+    }
 }
 
 impl Node {
