@@ -61,23 +61,15 @@ impl Destination<'_> {
 
     /// Renames the finished archive to its destination. Without `force`, a file created there
     /// meanwhile is kept.
-    pub(crate) fn finish(&self, mut archive: NamedTempFile) -> anyhow::Result<()> {
+    pub(crate) fn finish(&self, archive: NamedTempFile) -> anyhow::Result<()> {
         archive.as_file().sync_all().with_context(|| self.name())?;
-        loop {
-            let problem = match archive.persist_noclobber(self.file) {
-                Ok(_) => break,
-                Err(problem) => problem,
-            };
-            if problem.error.kind() != io::ErrorKind::AlreadyExists {
-                return Err(problem.error).with_context(|| self.name());
-            }
-            self.check()?;
-            archive = problem.file;
-            if self.force {
-                archive.persist(self.file).map_err(|e| e.error).with_context(|| self.name())?;
-                break;
-            }
-        }
+        self.check()?;
+        let renamed = if self.force {
+            archive.persist(self.file)
+        } else {
+            archive.persist_noclobber(self.file)
+        };
+        renamed.map_err(|e| e.error).with_context(|| self.name())?;
         sync_folder(self.folder()).with_context(|| self.name())
     }
 }
