@@ -26,4 +26,4 @@ mod transfer;
 
 pub use cli::main;
 // Used by the fuzz target.
-pub use import::{Imported, import};
+pub use import::import;
