@@ -13,13 +13,14 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{
-    MANIFEST_FILE, Manifest, bail_bad_input, format_count, format_size, print_line, report_line,
+    MANIFEST_FILE, Manifest, bail_bad_input, format_count, format_size, json_text, print_line,
+    report_line,
 };
 use serde::{Deserialize, Serialize};
 use store::{Record, Store};
 
 use crate::destination::Destination;
-use crate::intake::enter;
+use crate::intake::{protect, unprotect};
 use crate::progress::Progress;
 use crate::selection::{find_unique, keys_of_artifact, records_by_key, with_history};
 use crate::transfer::{ContentCheck, STORE_REMEDY};
@@ -64,22 +65,11 @@ pub(crate) fn export(
     stop: &Arc<AtomicBool>,
 ) -> anyhow::Result<()> {
     destination.check()?;
-    // A run that lists the artifacts protects them from `gc` during the export. The run is removed
-    // afterwards, so that `gc` doesn't keep the artifacts as those of a recent run.
-    let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
-    let id = run.id().to_owned();
-    let written = History::find(store, start, records_only).and_then(|history| {
-        let entered = enter(store, stop)?;
-        for (key, record) in &history.records {
-            run.record_action(&entered, &record.stage, key)?;
-        }
-        drop(entered);
-        history.write(store, destination, stop)
-    });
-    let ended = run.end();
-    store.remove_run(&id).ok();
-    written?;
-    Ok(ended?)
+    let history = History::find(store, start, records_only)?;
+    let run = protect(store, history.records.values(), stop)?;
+    let written = history.write(store, destination, stop);
+    unprotect(store, run)?;
+    written
 }
 
 /// Artifact with the records of its history and their stored objects.
@@ -184,9 +174,8 @@ struct Writer {
 
 impl Writer {
     fn write_json(&mut self, path: &str, value: &impl Serialize) -> anyhow::Result<()> {
-        let mut bytes = serde_json::to_vec_pretty(value)?;
-        bytes.push(b'\n');
-        append(&mut self.tar, path, bytes.len() as u64, bytes.as_slice())
+        let text = json_text(value)?;
+        append(&mut self.tar, path, text.len() as u64, text.as_bytes())
             .with_context(|| self.name.clone())
     }
 

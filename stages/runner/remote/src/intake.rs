@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{Damage, Failure, FileEntry, MANIFEST_FILE, Manifest, relative_path, report_line};
-use store::{Arrival, Entered, Locked, Record, RunFile, Store, is_hash};
+use store::{Arrival, Entered, Locked, Record, RunFile, Store, StoreError, is_hash};
 
 /// Maximum size of a record in bytes; usual ones have a few kilobytes. Chosen by hand.
 pub(crate) const MAX_RECORD_BYTES: u64 = 4 << 20;
@@ -33,7 +33,7 @@ pub(crate) struct Intake {
 
 impl Intake {
     pub(crate) fn begin(store: &Store, stop: &Arc<AtomicBool>) -> anyhow::Result<Self> {
-        let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
+        let run = protect(store, [], stop)?;
         let folder = store.scratch(run.id());
         Ok(Self { store: store.clone(), run: Some(run), folder, stop: Arc::clone(stop) })
     }
@@ -93,6 +93,29 @@ pub(crate) fn enter(store: &Store, stop: &AtomicBool) -> anyhow::Result<Entered>
         }
         std::thread::sleep(Duration::from_millis(20));
     }
+}
+
+/// Begins a run that lists the actions of records, which protects them from garbage collection.
+pub(crate) fn protect<'a>(
+    store: &Store,
+    records: impl IntoIterator<Item = &'a Record>,
+    stop: &AtomicBool,
+) -> anyhow::Result<RunFile> {
+    let entered = enter(store, stop)?;
+    let run = store.begin_run(&entered, std::env::args().collect())?;
+    for record in records {
+        run.record_action(&entered, &record.stage, &record.key())?;
+    }
+    Ok(run)
+}
+
+/// Ends a run and removes it, so that garbage collection doesn't keep the actions as those of a
+/// recent run.
+pub(crate) fn unprotect(store: &Store, run: RunFile) -> Result<(), StoreError> {
+    let id = run.id().to_owned();
+    let ended = run.end();
+    store.remove_run(&id).ok();
+    ended
 }
 
 /// Parses a record from a remote or an archive, called `name` in messages. Fails if its key differs

@@ -8,6 +8,7 @@ use artifact::{
 };
 use store::{Record, Store, StoreError};
 
+use crate::export::{action_entry, object_entry};
 use crate::folder::{ACTIONS, Listing};
 use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, parse_record, read_manifest};
 use crate::progress::Progress;
@@ -119,7 +120,7 @@ async fn fetch_record(
     key: String,
 ) -> anyhow::Result<Option<(String, Record)>> {
     progress.add(0)?;
-    let file = format!("actions/{key}.json");
+    let file = action_entry(&key);
     let Some(bytes) = remote.read(&file, MAX_RECORD_BYTES).await? else { return Ok(None) };
     let record = parse_record(&bytes, &key, &remote.name(&file))?;
     Ok(Some((key, record)))
@@ -172,7 +173,7 @@ async fn fetch_manifest(
     if intake.store.is_complete(&identity)? {
         return Ok(Object { identity, records, bytes: 0, is_stored: true });
     }
-    let file = format!("objects/{identity}/{MANIFEST_FILE}");
+    let file = object_entry(&identity, MANIFEST_FILE);
     let Some(bytes) = remote.read(&file, MAX_MANIFEST_BYTES).await? else {
         bail_bad_input!("{}: not found; push again from a complete store", remote.name(&file));
     };
@@ -200,7 +201,7 @@ async fn fetch_object(
     let manifest = read_manifest(&folder, &identity, &identity)?;
     run_all(manifest.files.into_iter().map(|entry| {
         let transfer = Arc::clone(&transfer);
-        let source = format!("objects/{identity}/{}", entry.path);
+        let source = object_entry(&identity, &entry.path);
         let target = folder.join(&entry.path);
         async move { transfer.download(&source, &target, &entry).await }
     }))

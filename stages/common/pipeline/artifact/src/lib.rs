@@ -35,7 +35,7 @@ mod type_words;
 
 pub use failure::{Failure, FailureExt, exit_code, one_line, permission_advice};
 pub use fsio::{
-    canonical_json, hash_json, sync_folder, temporary, write_atomically, write_json,
+    canonical_json, hash_json, json_text, sync_folder, temporary, write_atomically, write_json,
     write_json_atomically,
 };
 pub use given_input::GivenInput;
