@@ -14,9 +14,7 @@ use serde_json::Value;
 use store::{Arrival, Record, Store, is_hash};
 
 use crate::export::{EXPORT_FORMAT, INDEX_FILE, Index, action_entry, object_entry};
-use crate::intake::{
-    Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, create_file, parse_record, read_manifest,
-};
+use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, create_file, parse_record};
 use crate::progress::Progress;
 use crate::transfer::ContentCheck;
 
@@ -165,10 +163,7 @@ impl<'a, R: Read> Reader<'a, R> {
         let folder = self.intake.scratch(identity);
         let first = object_entry(identity, MANIFEST_FILE);
         let bytes = self.read_small(&first, MAX_MANIFEST_BYTES)?;
-        let path = folder.join(MANIFEST_FILE);
-        let written = std::fs::create_dir_all(&folder).and_then(|()| std::fs::write(&path, bytes));
-        written.with_context(|| path.display().to_string())?;
-        let manifest = read_manifest(&folder, identity, &self.entry_name(&first))?;
+        let manifest = self.intake.add_manifest(identity, &bytes, &self.entry_name(&first))?;
         for file in &manifest.files {
             let target = (!is_stored).then(|| folder.join(&file.path));
             self.read_file(identity, file, target.as_deref())?;

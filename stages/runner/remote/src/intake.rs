@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use anyhow::Context as _;
 use artifact::{Damage, Failure, FileEntry, MANIFEST_FILE, Manifest, relative_path, report_line};
 use store::{Arrival, Entered, Locked, Record, RunFile, Store, StoreError, is_hash};
 
@@ -41,6 +42,22 @@ impl Intake {
     /// Returns the folder in which an artifact is assembled.
     pub(crate) fn scratch(&self, identity: &str) -> PathBuf {
         self.folder.join(identity)
+    }
+
+    /// Writes a manifest from a remote or an archive, called `name` in messages, to an artifact's
+    /// scratch folder, and reads it.
+    pub(crate) fn add_manifest(
+        &self,
+        identity: &str,
+        bytes: &[u8],
+        name: &str,
+    ) -> anyhow::Result<Manifest> {
+        let folder = self.scratch(identity);
+        let path = folder.join(MANIFEST_FILE);
+        fs::create_dir_all(&folder)
+            .and_then(|()| fs::write(&path, bytes))
+            .with_context(|| path.display().to_string())?;
+        Ok(read_manifest(&folder, identity, name)?)
     }
 
     /// Imports an object, if given, then its records. Returns the number of new records.
@@ -138,13 +155,9 @@ pub(crate) fn parse_record(bytes: &[u8], key: &str, name: &str) -> Result<Record
     Err(Failure::BadInput(format!("{name}: {problem}")))
 }
 
-/// Reads a manifest from a remote or an archive, called `name` in messages, in a scratch folder.
-/// Fails if its identity differs, or if it contains paths that nerf-sr doesn't write.
-pub(crate) fn read_manifest(
-    folder: &Path,
-    identity: &str,
-    name: &str,
-) -> Result<Manifest, Failure> {
+/// Reads a manifest, called `name` in messages, in a scratch folder. Fails if its identity differs,
+/// or if it contains paths that nerf-sr doesn't write.
+fn read_manifest(folder: &Path, identity: &str, name: &str) -> Result<Manifest, Failure> {
     let problem = match Manifest::read(folder) {
         Err(Damage::Manifest { reason, .. }) => format!("not a manifest: {reason}"),
         Err(damage) => damage.to_string(),
