@@ -3,7 +3,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-use artifact::report_line;
+use artifact::{format_size, report_line};
 use serde::{Deserialize, Serialize};
 
 use crate::hooks::TestHooks;
@@ -74,6 +74,8 @@ pub(crate) fn failed_event(message: &str) -> Option<String> {
 pub struct Progress {
     label: String,
     total: u64,
+    /// True if steps are bytes, which are reported as sizes.
+    counts_bytes: bool,
     mode: ProgressMode,
     bar: Option<indicatif::ProgressBar>,
     state: Mutex<ProgressState>,
@@ -113,11 +115,19 @@ impl Progress {
         Self {
             label: label.to_owned(),
             total,
+            counts_bytes: false,
             mode,
             bar,
             state: Mutex::new(state),
             hooks: TestHooks::default(),
         }
+    }
+
+    /// Creates progress at 0 of `total` bytes.
+    pub fn of_bytes(label: &str, total: u64, mode: ProgressMode) -> Self {
+        let mut progress = Self::new(label, total, mode);
+        progress.counts_bytes = true;
+        progress
     }
 
     /// Creates progress without reports, for tests.
@@ -149,6 +159,14 @@ impl Progress {
         self.update(|state| state.done += steps);
     }
 
+    /// Prints a line on stderr without disturbing the bar.
+    pub fn log_line(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| report_line!("{line}")),
+            None => report_line!("{line}"),
+        }
+    }
+
     fn update(&self, change: impl FnOnce(&mut ProgressState)) {
         let mut state = self.lock();
         change(&mut state);
@@ -177,9 +195,13 @@ impl Progress {
         (state.reported, state.has_reported) = (Instant::now(), true);
         let estimate = state.seconds_left;
         let left = state.pace.time_left(done, self.total, estimate);
+        let [done_text, total_text] = [done, self.total]
+            .map(|n| if self.counts_bytes { format_size(n) } else { n.to_string() });
+        let steps = format!("{done_text} of {total_text}");
         if let Some(bar) = &self.bar {
+            let sizes = if self.counts_bytes { &steps } else { "" };
             bar.set_position(done);
-            bar.set_message(join_parts(&[&state.note, &left]));
+            bar.set_message(join_parts(&[sizes, &state.note, &left]));
         } else if self.mode == ProgressMode::Json {
             Event::Progress {
                 label: self.label.clone(),
@@ -190,7 +212,6 @@ impl Progress {
             }
             .emit();
         } else {
-            let steps = format!("{done} of {}", self.total);
             report_line!("{}: {}", self.label, join_parts(&[&steps, &state.note, &left]));
         }
     }
