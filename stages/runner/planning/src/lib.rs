@@ -27,13 +27,11 @@
 
 mod arguments;
 mod axes;
-mod changes;
 mod check;
 mod confirm;
 mod expand;
 mod experiment;
 mod experiment_axes;
-mod extend;
 mod file;
 mod frozen;
 mod given_folders;
@@ -51,11 +49,13 @@ mod stamp;
 mod targets;
 mod yaml_lines;
 
-pub use changes::{Change, changes, short_hash};
 pub use experiment::{Experiment, Selection, Variant};
 pub use file::{Part, PipelineError, PipelineFile, StageBlock};
 pub use frozen::FrozenPlan;
-pub use key::{environment_parts, explain, key_parts, nearest_changes, nearest_record};
+pub use key::{
+    Change, changes, environment_parts, explain, key_parts, nearest_changes, nearest_record,
+    short_hash,
+};
 pub use node::{Devices, Node, NodeInput, Origin, Plan, ShownPoint, Sink, State};
 pub use pipeline::Pipeline;
 pub use plan::{HashedInputs, hash_inputs, read_source, stored_inputs};
