@@ -132,8 +132,8 @@ impl Store {
             Ok(_) => "the record belongs to another action".to_owned(),
             Err(error) => format!("the record is damaged: {error}"),
         };
-        let remedy = "remove the record by `nerf-sr verify --remove`".to_owned();
-        Err(StoreError::Content { path, problem, remedy })
+        let problem = problem + "; remove the record by `nerf-sr verify --remove`";
+        Err(StoreError::Content { path, problem })
     }
 
     /// Returns all undamaged records, sorted by key.

@@ -147,16 +147,15 @@ impl FileKind {
     }
 
     fn damage(self, path: PathBuf, id: &str) -> StoreError {
-        let (problem, remedy) = match self {
-            Self::Run => (
-                "the run's file is damaged",
-                "move the file away, after which `gc` may delete what the run used".to_owned(),
-            ),
+        let problem = match self {
+            Self::Run => "the run's file is damaged; move the file away, after which `gc` may \
+                delete what the run used"
+                .to_owned(),
             Self::Pin => {
-                ("the pin is damaged", format!("run `nerf-sr unpin {id}`, then pin again"))
+                format!("the pin is damaged; run `nerf-sr unpin {id}`, then pin again")
             }
         };
-        StoreError::Content { path, problem: problem.to_owned(), remedy }
+        StoreError::Content { path, problem }
     }
 }
 
