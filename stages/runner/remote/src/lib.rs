@@ -12,7 +12,6 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod cli;
-mod destination;
 mod export;
 mod folder;
 mod import;
