@@ -34,7 +34,6 @@ mod experiment;
 mod experiment_axes;
 mod file;
 mod frozen;
-mod given_folders;
 mod key;
 mod left_out;
 mod node;

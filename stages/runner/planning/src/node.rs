@@ -6,6 +6,7 @@ use artifact::{FailedPoint, RunInput, hash_json, label};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use slurm::Resources;
+use stage::GivenInputs;
 use store::{PartialKey, Record};
 
 use crate::stages::StageProgram;
@@ -165,6 +166,15 @@ impl Node {
     /// Returns the indices of the nodes that produce the inputs.
     pub fn parents(&self) -> impl Iterator<Item = usize> + '_ {
         self.inputs.iter().filter_map(NodeInput::node)
+    }
+
+    /// Returns the inputs, each with the parameters of the node that produces the input; `None` for
+    /// a folder. `nodes` are all nodes of the plan.
+    pub(crate) fn given_inputs(&self, nodes: &[Self]) -> GivenInputs {
+        let inputs = self.inputs.iter();
+        inputs
+            .map(|input| (input.name.clone(), input.node().map(|i| nodes[i].parameters.clone())))
+            .collect()
     }
 
     /// Returns the inputs for the record of a run. `index_in_record` converts a node's index in the
