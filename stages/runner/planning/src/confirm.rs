@@ -7,9 +7,9 @@ use std::sync::atomic::AtomicBool;
 use store::Store;
 
 use crate::request::PlanError;
+use crate::sources::Stamp;
 use crate::stage_call::describe_all;
 use crate::stages::{DescriptionCache, StageProgram, is_own};
-use crate::stamp::Stamp;
 
 fn changed(path: &Path) -> PlanError {
     let problem = "was changed or rebuilt after planning; run again";

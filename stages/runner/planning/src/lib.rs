@@ -44,7 +44,6 @@ mod request;
 mod sources;
 pub mod stage_call;
 mod stages;
-mod stamp;
 mod targets;
 mod yaml_lines;
 
@@ -60,7 +59,6 @@ pub use pipeline::Pipeline;
 pub use plan::{HashedInputs, hash_inputs, read_source, stored_inputs};
 pub use quality::Quality;
 pub use request::{PlanError, Request};
-pub use sources::{Source, SourceError};
+pub use sources::{Source, SourceError, Stamp};
 pub use stages::{Describing, Programs, StageProgram, executable, is_own, own_program};
-pub use stamp::Stamp;
 pub use targets::find_targets;

@@ -18,8 +18,8 @@ use store::Store;
 use crate::file::{Part, PipelineError, StageBlock};
 use crate::pipeline::Pipeline;
 use crate::request::PlanError;
+use crate::sources::Stamp;
 use crate::stage_call::{ProgramError, describe_all};
-use crate::stamp::Stamp;
 
 /// Program of a stage, with its description.
 #[derive(Debug)]
