@@ -48,19 +48,17 @@
 mod arguments;
 mod context;
 mod contract;
+mod ending;
 mod help;
-mod hooks;
 mod memory;
 #[cfg(test)]
 mod panic_tests;
-mod panics;
 mod parts;
 mod processors;
 mod progress;
 mod run;
 #[cfg(test)]
 mod signal_tests;
-mod signals;
 mod stage;
 mod staging;
 mod training;
@@ -71,16 +69,14 @@ pub use contract::{
     ContractError, Description, GivenInputs, Input, Output, PARAMETER_GROUPS, ParameterDoc,
     ParameterProblem, ParameterSection, Rule, Schema, group_parameters, plain,
 };
+pub use ending::{install_panic_hook, stop_on_signals, stop_signals};
 pub use help::render_help;
-pub use hooks::{SLOW_VARIABLE, STOP_VARIABLE};
 pub use memory::{
     MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory_message,
     remaining_memory,
 };
-pub use panics::install_panic_hook;
 pub use processors::{ALL_PROCESSORS, Processors, processors, start_threads};
-pub use progress::{Event, Pace, Progress, ProgressMode, join_parts};
+pub use progress::{Event, Pace, Progress, ProgressMode, SLOW_VARIABLE, STOP_VARIABLE, join_parts};
 pub use run::{RUNNER_VARIABLE, run_stage};
-pub use signals::{stop_on_signals, stop_signals};
 pub use stage::Stage;
 pub use training::{CheckpointSchedule, Training};

@@ -19,11 +19,10 @@ use serde_json::Value;
 
 use crate::arguments::{Arguments, Command, Parameters, input_folders, read_params};
 use crate::context::Context;
+use crate::ending::{EndClaim, install_panic_hook, stop_on_signals};
 use crate::help::render_help;
-use crate::panics::install_panic_hook;
 use crate::processors::{Processors, processors, start_threads};
 use crate::progress::{ProgressMode, enable_failure_event, failed_event};
-use crate::signals::{EndClaim, stop_on_signals};
 use crate::stage::Stage;
 use crate::staging::Staging;
 
