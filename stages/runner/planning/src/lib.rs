@@ -28,7 +28,6 @@
 mod arguments;
 mod axes;
 mod check;
-mod confirm;
 mod expand;
 mod experiment;
 mod experiment_axes;
