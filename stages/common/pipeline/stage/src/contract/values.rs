@@ -34,7 +34,7 @@ impl<'a> Reader<'a> {
                 if schemas.iter().any(|s| has_type(s, "integer"))
                     && !schemas.iter().any(|s| has_type(s, "string")) =>
             {
-                with_suffix(text).map_or_else(|| value.clone(), Value::from)
+                with_suffix(text).unwrap_or_else(|| value.clone())
             }
             Value::Array(items) => {
                 let items = items.iter().enumerate().map(|(index, item)| {
@@ -141,21 +141,14 @@ fn as_integer(number: &Number) -> Option<Value> {
 }
 
 /// Converts a number with the suffix k, M or G, such as `1.5M`; `None` if the result isn't whole.
-fn with_suffix(text: &str) -> Option<u64> {
-    let (digits, zeros) = [("k", 3), ("M", 6), ("G", 9)]
+fn with_suffix(text: &str) -> Option<Value> {
+    let (digits, exponent) = [("k", "e3"), ("M", "e6"), ("G", "e9")]
         .into_iter()
-        .find_map(|(suffix, zeros)| Some((text.strip_suffix(suffix)?, zeros)))?;
-    let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
-    let is_written = |part: &str| part.bytes().all(|digit| digit.is_ascii_digit());
-    // As JSON does, a number starts with a digit, and a dot is followed by one.
-    if whole.is_empty() || digits.ends_with('.') || !is_written(whole) || !is_written(fraction) {
+        .find_map(|(suffix, exponent)| Some((text.strip_suffix(suffix)?, exponent)))?;
+    if digits.contains(|c: char| !c.is_ascii_digit() && c != '.') {
         return None;
     }
-    let fraction = fraction.trim_end_matches('0');
-    if fraction.len() > zeros {
-        return None;
-    }
-    format!("{whole}{fraction:0<zeros$}").parse().ok()
+    as_integer(&serde_json::from_str(&format!("{digits}{exponent}")).ok()?)
 }
 
 #[cfg(test)]
