@@ -306,26 +306,23 @@ fn runner_folder() -> PathBuf {
 fn identify(path: &Path, name: &str) -> Result<FileIdentity, ProgramError> {
     let stamp =
         if path.is_dir() { Err(std::io::ErrorKind::IsADirectory.into()) } else { Stamp::of(path) };
-    let is_unstamped = stamp.is_err();
-    let error = match stamp {
-        Ok(stamp) if is_own(path) => return Ok(FileIdentity { stamp, blake3: None }),
-        Ok(stamp) => match hash_file(path) {
-            Ok(hash) => return Ok(FileIdentity { stamp, blake3: Some(hash) }),
-            Err(error) => error,
-        },
-        Err(error) => error,
-    };
-    let path = path.display();
-    Err(ProgramError(if is_unstamped && name.contains('/') {
-        format!("{path}: {error}; set `run:` to the stage's executable")
-    } else if is_unstamped && error.kind() == std::io::ErrorKind::NotFound {
-        let suggestion = suggestion(name, own_programs().iter().map(String::as_str));
-        format!(
-            "{path} isn't built; {suggestion}run `make build`, or set `run:` to another program"
-        )
-    } else {
-        format!("{path}: {error}")
-    }))
+    let failure = |error| ProgramError(format!("{}: {error}", path.display()));
+    let stamp = stamp.map_err(|error| {
+        if name.contains('/') {
+            failure(format!("{error}; set `run:` to the stage's executable"))
+        } else if error.kind() == std::io::ErrorKind::NotFound {
+            let suggestion = suggestion(name, own_programs().iter().map(String::as_str));
+            let remedy = "run `make build`, or set `run:` to another program";
+            ProgramError(format!("{} isn't built; {suggestion}{remedy}", path.display()))
+        } else {
+            failure(error.to_string())
+        }
+    })?;
+    if is_own(path) {
+        return Ok(FileIdentity { stamp, blake3: None });
+    }
+    let hash = hash_file(path).map_err(|error| failure(error.to_string()))?;
+    Ok(FileIdentity { stamp, blake3: Some(hash) })
 }
 
 /// Returns the names of the programs in the runner's folder.

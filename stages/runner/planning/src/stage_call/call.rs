@@ -242,14 +242,8 @@ impl Call<'_> {
         if self.from_checkpoint {
             command.arg("--from-checkpoint");
         }
-        command.args([
-            "--device",
-            self.device,
-            "--threads",
-            &self.threads.to_string(),
-            "--progress",
-            "json",
-        ]);
+        command.args(["--device", self.device, "--threads", &self.threads.to_string()]);
+        command.args(["--progress", "json"]);
         set_environment(&mut command, &self.description.environment);
         command.env(stage::RUNNER_VARIABLE, std::process::id().to_string());
         command.stdout(Stdio::piped()).stderr(Stdio::piped());

@@ -32,7 +32,7 @@
 //!     threads: 2,
 //!     lock: None,
 //! };
-//! let display = Display::new();
+//! let display = Display::default();
 //! let view = display.start(call.label);
 //! match call.run(Path::new("log"), &view, &AtomicBool::new(false)) {
 //!     Ok(usage) => println!("processor time: {}", usage.processor_seconds),
