@@ -226,7 +226,7 @@ impl Scope<'_> {
             }
             Kind::Input | Kind::Quality => {
                 let folders = arguments::folders(text).map_err(|e| usage_error(&argument, e))?;
-                folders.into_iter().map(|text| (text, canonical_folder(text))).collect()
+                folders.into_iter().map(|text| (text, canonical_folder(text.as_ref()))).collect()
             }
         };
         let settings = texts_and_values.into_iter().map(|(text, value)| {
@@ -381,7 +381,7 @@ fn usage_error(argument: &str, problem: impl std::fmt::Display) -> PlanError {
 }
 
 /// Returns the canonical path of a folder as a setting's value.
-pub(crate) fn canonical_folder(name: &str) -> Value {
-    let path = Path::new(name).canonicalize().unwrap_or_else(|_| PathBuf::from(name));
-    Value::from(path.to_string_lossy())
+pub(crate) fn canonical_folder(path: &Path) -> Value {
+    let canonical = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    Value::from(canonical.to_string_lossy())
 }
