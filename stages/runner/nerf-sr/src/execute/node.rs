@@ -192,7 +192,7 @@ impl NodeJob<'_> {
             from_checkpoint: false,
             device: self.device(),
             threads: self.threads,
-            lock: Some(lock.file()),
+            lock: Some(&lock.file),
         };
         let stage_display = self.display.start(&label);
         let earlier = attempt.time_spent();
