@@ -175,7 +175,7 @@ fn call(
         threads,
         lock: None,
     };
-    let result = call.run(&scratch.join("log"), &view, run.stop);
+    let (_, result) = call.run(&scratch.join("log"), &view, run.stop);
     view.end();
     result?;
     program.confirm_again()

@@ -34,11 +34,12 @@
 //! };
 //! let display = Display::default();
 //! let view = display.start(call.label);
-//! match call.run(Path::new("log"), &view, &AtomicBool::new(false)) {
-//!     Ok(usage) => println!("processor time: {}", usage.processor_seconds),
-//!     Err(failure) => println!("{}", failure.message),
-//! }
+//! let (usage, result) = call.run(Path::new("log"), &view, &AtomicBool::new(false));
 //! view.end();
+//! println!("processor time: {}", usage.processor_seconds);
+//! if let Err(failure) = result {
+//!     println!("{}", failure.message);
+//! }
 //! ```
 
 mod call;
