@@ -49,7 +49,6 @@ mod arguments;
 mod context;
 mod contract;
 mod ending;
-mod help;
 mod memory;
 #[cfg(test)]
 mod panic_tests;
@@ -67,10 +66,9 @@ pub use arguments::check_device;
 pub use context::{Context, SUMMARY_FILE};
 pub use contract::{
     ContractError, Description, GivenInputs, Input, Output, PARAMETER_GROUPS, ParameterDoc,
-    ParameterProblem, ParameterSection, Rule, Schema, group_parameters, plain,
+    ParameterProblem, ParameterSection, Rule, Schema, group_parameters, plain, render_help,
 };
 pub use ending::{install_panic_hook, stop_on_signals, stop_signals};
-pub use help::render_help;
 pub use memory::{
     MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory_message,
     remaining_memory,
