@@ -22,9 +22,8 @@ use tempfile::NamedTempFile;
 
 use crate::folder::{Affixes, remove_leftovers};
 use crate::intake::{protect, unprotect};
-use crate::progress::Progress;
 use crate::selection::{find_unique, keys_of_artifact, records_by_key, with_history};
-use crate::transfer::{ContentCheck, STORE_REMEDY};
+use crate::transfer::{ContentCheck, Progress, STORE_REMEDY};
 
 /// Name of the first entry.
 pub(crate) const INDEX_FILE: &str = "export.json";

@@ -15,8 +15,7 @@ use store::{Arrival, Record, Store, is_hash};
 
 use crate::export::{EXPORT_FORMAT, INDEX_FILE, Index, action_entry, object_entry};
 use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, create_file, parse_record};
-use crate::progress::Progress;
-use crate::transfer::ContentCheck;
+use crate::transfer::{ContentCheck, Progress};
 
 /// Maximum length of a path in an archive, in bytes; twice that of Linux.
 const MAX_PATH_BYTES: u64 = 8 << 10;

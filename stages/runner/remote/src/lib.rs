@@ -16,7 +16,6 @@ mod export;
 mod folder;
 mod import;
 mod intake;
-mod progress;
 mod pull;
 mod push;
 mod remote;

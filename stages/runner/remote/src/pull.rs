@@ -11,10 +11,9 @@ use store::{Record, Store, StoreError};
 use crate::export::{action_entry, object_entry};
 use crate::folder::{ACTIONS, Listing};
 use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, parse_record};
-use crate::progress::Progress;
 use crate::remote::{Access, Remote};
 use crate::selection::Selection;
-use crate::transfer::{Transfer, run_all};
+use crate::transfer::{Progress, Transfer, run_all};
 
 /// Copies finished actions and their artifacts from a remote, unless the store has them.
 pub(crate) async fn pull(

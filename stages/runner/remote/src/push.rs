@@ -10,10 +10,9 @@ use store::{Record, Store};
 
 use crate::export::action_entry;
 use crate::intake::{protect, unprotect};
-use crate::progress::Progress;
 use crate::remote::{Access, Remote};
 use crate::selection::{Selection, records_by_key};
-use crate::transfer::{Transfer, run_all};
+use crate::transfer::{Progress, Transfer, run_all};
 
 /// Copies finished actions and their artifacts to a remote, unless it has them.
 pub(crate) async fn push(
