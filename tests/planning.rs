@@ -434,5 +434,7 @@ fn utf16_is_refused_with_advice_and_a_byte_order_mark_is_accepted() {
     project.write("pipeline.yaml", &format!("\u{feff}{}", TINY.replace('\n', "\r\n")));
     project.ok(&["plan"]);
     project.write("pipeline.yaml", "default: [../x]\nstages:\n  ../x: {run: report}\n");
-    project.run(&["plan"]).fails(2, &["pipeline.yaml:3: stage \"../x\": choose a name of 1 to 100 bytes"]);
+    project
+        .run(&["plan"])
+        .fails(2, &["pipeline.yaml:3: stage \"../x\": choose a name of 1 to 100 bytes"]);
 }
