@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use common::{Finished, Project, bin, stage_command};
-use stage::{ProcessorLimit, processors};
+use stage::{ALL_PROCESSORS, processors};
 
 /// Slurm's environment variables that limit the number of processors.
 const VARIABLES: [&str; 2] = ["SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"];
@@ -58,7 +58,7 @@ fn affinity_limits_threads_of_stages_and_runs() {
     };
     let launcher = ["taskset", "-c", processor.as_str()];
     let line = reported_threads(&project, &launcher, None);
-    if processors().limit == ProcessorLimit::Machine && processors().count == 1 {
+    if processors().limit == ALL_PROCESSORS && processors().count == 1 {
         assert_eq!(line, "1 thread: all processors of this machine");
         return;
     }

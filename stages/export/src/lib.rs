@@ -45,7 +45,7 @@ use scene::{Bounds, Camera, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Stage};
-use workload::ExportViews;
+use workload::{export_bytes, export_scale};
 
 use cameras::CameraFormat;
 use coordinates::Coordinates;
@@ -189,7 +189,7 @@ fn summary_text(summary: &ExportSummary) -> String {
 
 /// Resizes cameras to `width`, or to the default size at which the field is rendered.
 fn resize_cameras(cameras: &[Camera], width: Option<u32>) -> Vec<Camera> {
-    let default_scale = ExportViews::default_scale(cameras.iter().map(pixel_count).sum());
+    let default_scale = export_scale(cameras.iter().map(pixel_count).sum());
     let mut resized = Vec::with_capacity(cameras.len());
     for camera in cameras {
         let k = &camera.intrinsics;
@@ -225,8 +225,8 @@ fn render_views(
 
 /// Returns the peak memory of an export in bytes.
 fn memory_need(cameras: &[Camera], lattice: Option<&Lattice>) -> u64 {
-    let views = ExportViews { pixels: cameras.iter().map(pixel_count).sum() };
-    views.bytes(lattice.map_or(0, |lattice| lattice.len() as u64))
+    let pixels = cameras.iter().map(pixel_count).sum();
+    export_bytes(pixels, lattice.map_or(0, |lattice| lattice.len() as u64))
 }
 
 /// Inputs and rendered views of an export.

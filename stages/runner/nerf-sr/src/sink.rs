@@ -159,7 +159,7 @@ fn call(
         .and_then(|()| write_json(&params, &sink.parameters))
         .map_err(|e| StageFailure::at(scratch, &e))?;
     let program = ConfirmedProgram::new(&sink.program, run.store, run.stop)?;
-    let display = Display::new();
+    let display = Display::default();
     let view = display.start(&sink.stage);
     let call = Call {
         label: &sink.stage,
@@ -175,7 +175,7 @@ fn call(
         threads,
         lock: None,
     };
-    let result = call.run(&scratch.join("log"), &view, run.stop);
+    let (_, result) = call.run(&scratch.join("log"), &view, run.stop);
     view.end();
     result?;
     program.confirm_again()

@@ -10,12 +10,11 @@ use std::sync::atomic::AtomicBool;
 use artifact::{Damage, MANIFEST_FILE, Manifest, write_atomically};
 use planning::stage_call::StageFailure;
 use planning::{
-    ConfirmError, HashedInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp,
-    read_source,
+    HashedInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp, read_source,
 };
 use store::{Attempt, Store};
 
-use crate::failure;
+use crate::{failure, plan_exit_code};
 
 /// A program that was confirmed before its start.
 pub(crate) struct ConfirmedProgram<'a> {
@@ -43,10 +42,8 @@ impl<'a> ConfirmedProgram<'a> {
     }
 }
 
-fn confirmation_failure(problem: &ConfirmError) -> StageFailure {
-    let is_interrupted = matches!(problem, ConfirmError::Interrupted);
-    let code = if is_interrupted { StageFailure::INTERRUPTED } else { StageFailure::USAGE };
-    StageFailure { code, message: problem.to_string() }
+fn confirmation_failure(problem: &PlanError) -> StageFailure {
+    StageFailure { code: plan_exit_code(problem), message: problem.to_string() }
 }
 
 /// Returns the failure of a stage whose inputs can't be used.

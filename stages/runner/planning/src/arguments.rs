@@ -57,23 +57,15 @@ fn split(text: &str) -> Vec<&str> {
     parts
 }
 
-/// Returns the position of the first comma outside brackets and quotes, or the length of the text.
+/// Returns the position of the first comma after the JSON value at the start of a text, or the
+/// length of the text.
 fn json_end(text: &str) -> usize {
-    let mut depth = 0usize;
-    let mut is_quoted = false;
-    let mut is_escaped = false;
-    for (at, c) in text.char_indices() {
-        match c {
-            _ if is_escaped => is_escaped = false,
-            '\\' if is_quoted => is_escaped = true,
-            '"' => is_quoted = !is_quoted,
-            '[' | '{' if !is_quoted => depth += 1,
-            ']' | '}' if !is_quoted => depth = depth.saturating_sub(1),
-            ',' if !is_quoted && depth == 0 => return at,
-            _ => {}
-        }
+    let mut values = serde_json::Deserializer::from_str(text).into_iter::<Value>();
+    if values.next().is_none_or(|value| value.is_err()) {
+        return text.len();
     }
-    text.len()
+    let end = values.byte_offset();
+    text[end..].find(',').map_or(text.len(), |comma| end + comma)
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use artifact::known_names;
+use artifact::{known_names, suggestion};
 use serde_json::Value;
 
 use crate::arguments;
@@ -226,7 +226,7 @@ impl Scope<'_> {
             }
             Kind::Input | Kind::Quality => {
                 let folders = arguments::folders(text).map_err(|e| usage_error(&argument, e))?;
-                folders.into_iter().map(|text| (text, canonical_folder(text))).collect()
+                folders.into_iter().map(|text| (text, canonical_folder(text.as_ref()))).collect()
             }
         };
         let settings = texts_and_values.into_iter().map(|(text, value)| {
@@ -314,13 +314,11 @@ impl Scope<'_> {
     fn unknown_name(&self, kind: Kind, name: &str) -> PlanError {
         let programs = self.pipeline.stages.keys().filter_map(|stage| self.programs.get(stage));
         let known: BTreeSet<&str> = programs.flat_map(|program| kind.names(program)).collect();
-        let suggestion = artifact::nearest(name, known)
-            .map(|known| format!("did you mean {known}? "))
-            .unwrap_or_default();
         let mut problem = format!(
-            "{} {name}: no stage has this {}; {suggestion}see `STAGE --help`",
+            "{} {name}: no stage has this {}; {}see `STAGE --help`",
             kind.flag(),
-            kind.noun()
+            kind.noun(),
+            suggestion(name, known)
         );
         let unusable: Vec<&str> = self.programs.unusable().collect();
         if !unusable.is_empty() {
@@ -383,7 +381,7 @@ fn usage_error(argument: &str, problem: impl std::fmt::Display) -> PlanError {
 }
 
 /// Returns the canonical path of a folder as a setting's value.
-pub(crate) fn canonical_folder(name: &str) -> Value {
-    let path = Path::new(name).canonicalize().unwrap_or_else(|_| PathBuf::from(name));
-    Value::from(path.to_string_lossy())
+pub(crate) fn canonical_folder(path: &Path) -> Value {
+    let canonical = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    Value::from(canonical.to_string_lossy())
 }

@@ -12,7 +12,6 @@ use crate::axes::{Axis, Kind, Setting};
 use crate::check::dependencies;
 use crate::experiment::Selection;
 use crate::file::{InputSource, Part};
-use crate::given_folders::given_inputs;
 use crate::left_out::{RequiredFiles, check_show, shown_stages};
 use crate::node::{Node, NodeInput, Origin, Plan, ShownPoint, Sink};
 use crate::pipeline::Pipeline;
@@ -233,7 +232,7 @@ impl<'a> Expansion<'a> {
 
     /// Checks the rules of a stage's description, which may refer to the parameters of its parents.
     fn check_rules(&self, node: &Node) -> Result<(), PlanError> {
-        let inputs = given_inputs(node, &self.nodes);
+        let inputs = node.given_inputs(&self.nodes);
         match node.program.description.broken_rule(&node.parameters, &inputs) {
             Some(problem) => Err(PlanError::Usage(format!("stage {}: {problem}", node.label()))),
             None => Ok(()),

@@ -5,7 +5,7 @@ use serde_json::{Map, Value};
 use stage::plain;
 
 use crate::axes::{Axis, AxisValue, Kind, Scope, Setting, canonical_folder};
-use crate::experiment::{Experiment, Selection};
+use crate::experiment::{Experiment, Selection, Variant};
 use crate::request::{PlanError, Request};
 
 /// Scene with the pipeline's own data set.
@@ -56,11 +56,8 @@ impl SelectedExperiment<'_> {
             let mut settings = common.clone();
             if name != DEMO {
                 let folder = self.scene_folder(name)?;
-                settings.extend(self.for_all_inputs(&self.scope.setting(
-                    Kind::Input,
-                    "dataset",
-                    &folder,
-                )?));
+                let setting = self.scope.setting(Kind::Input, "dataset", &folder)?;
+                settings.extend(self.for_all_inputs(&setting));
             }
             values.push(AxisValue { text: name.clone(), settings });
         }
@@ -89,7 +86,7 @@ impl SelectedExperiment<'_> {
         for folder in self.experiment.folders.iter().map(String::as_str).chain(["."]) {
             let path = data.join(folder).join(name);
             if path.is_dir() {
-                return Ok(canonical_folder(&path.to_string_lossy()));
+                return Ok(canonical_folder(&path));
             }
         }
         Err(PlanError::Usage(format!(
@@ -105,8 +102,7 @@ impl SelectedExperiment<'_> {
         for (name, folder) in inputs {
             let path = data.join(folder);
             if path.is_dir() {
-                let folder = canonical_folder(&path.to_string_lossy());
-                settings.push(self.scope.setting(Kind::Input, name, &folder)?);
+                settings.push(self.scope.setting(Kind::Input, name, &canonical_folder(&path))?);
             }
         }
         Ok(settings)
@@ -159,18 +155,15 @@ impl SelectedExperiment<'_> {
                 return Err(PlanError::Usage(format!("no variant {name:?}; {known}")));
             }
         }
-        let mut values = Vec::new();
-        for variant in all {
-            if selected.is_empty() || selected.contains(&variant.name) {
-                if self.selection.max_variants.is_some_and(|max| values.len() >= max) {
-                    break;
-                }
-                let mut settings = self.parameters(&variant.parameters)?;
-                settings.extend(self.inputs(&variant.inputs)?);
-                values.push(AxisValue { text: variant.name.clone(), settings });
-            }
-        }
-        Ok(values)
+        let mut chosen: Vec<&Variant> = all.iter().collect();
+        chosen.retain(|variant| selected.is_empty() || selected.contains(&variant.name));
+        chosen.truncate(self.selection.max_variants.unwrap_or(usize::MAX));
+        let values = chosen.into_iter().map(|variant| {
+            let mut settings = self.parameters(&variant.parameters)?;
+            settings.extend(self.inputs(&variant.inputs)?);
+            Ok(AxisValue { text: variant.name.clone(), settings })
+        });
+        values.collect()
     }
 
     /// Returns the axis of a parameter with several values.

@@ -202,14 +202,18 @@ impl ParsedFile {
     /// Parses a pipeline file. Fails on duplicate keys, unknown keys and wrong types.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let text = crate::yaml_lines::decode(bytes)
-            .map_err(|e| PipelineError::new(path, e.line, e.problem))?;
+            .map_err(|line| PipelineError::new(path, Some(line), "not UTF-8; save it as UTF-8"))?;
         let content = parse_content(text, path)?;
         let canonical_path = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
         let file =
             Self { path: path.to_path_buf(), canonical_path, content, text: text.to_owned() };
         for name in file.content.stages.keys() {
-            if let Some(problem) = stage_name_problem(name) {
-                return Err(file.error(&["stages", name], format!("stage {name:?}: {problem}")));
+            if !is_stage_name(name) {
+                let problem = format!(
+                    "stage {name:?}: choose a name of 1 to {MAX_NAME_BYTES} bytes without `/`, `\\`, \
+                    `..`, white space and control characters that starts with neither `.` nor `-`"
+                );
+                return Err(file.error(&["stages", name], problem));
             }
         }
         Ok(file)
@@ -267,21 +271,13 @@ fn parse_content(text: &str, path: &Path) -> Result<PipelineFile, PipelineError>
 /// Maximum length of a stage's name, which becomes part of file names; chosen by hand.
 const MAX_NAME_BYTES: usize = 100;
 
-/// Returns why a stage's name can't be part of file names and command lines; `None` if it can.
-fn stage_name_problem(name: &str) -> Option<&'static str> {
-    if name.is_empty() {
-        Some("name is empty")
-    } else if name.starts_with(['.', '-']) {
-        Some("name must not start with `.` or `-`")
-    } else if name.contains(['/', '\\']) || name.contains("..") {
-        Some("name must not contain `/`, `\\` or `..`")
-    } else if name.chars().any(|c| c.is_control() || c.is_whitespace()) {
-        Some("name must not contain white space or control characters")
-    } else if name.len() > MAX_NAME_BYTES {
-        Some("name must not be longer than 100 bytes")
-    } else {
-        None
-    }
+/// Returns whether a stage's name can be part of file names and command lines.
+fn is_stage_name(name: &str) -> bool {
+    let is_forbidden = |c: char| c.is_control() || c.is_whitespace() || ['/', '\\'].contains(&c);
+    (1..=MAX_NAME_BYTES).contains(&name.len())
+        && !name.starts_with(['.', '-'])
+        && !name.contains("..")
+        && !name.contains(is_forbidden)
 }
 
 /// Returns the parser's message without the line, which the location contains.

@@ -5,13 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::FailedPoint;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use slurm::Resources;
 use stage::Description;
 
-use crate::node::{Devices, Node, NodeInput, Origin, Plan, ShownPoint, Sink};
+use crate::node::{Devices, Node, NodeInput, Origin, Plan, Sink};
 use crate::stage_call::ProgramError;
 use crate::stages::StageProgram;
 
@@ -23,27 +21,8 @@ pub struct FrozenPlan {
     devices: Devices,
     resources: BTreeMap<String, Resources>,
     programs: BTreeMap<PathBuf, Description>,
-    nodes: Vec<FrozenNode>,
-    sinks: Vec<FrozenSink>,
-}
-
-#[derive(Clone, Serialize, Deserialize)]
-struct FrozenNode {
-    stage: String,
-    point: String,
-    values: BTreeMap<String, String>,
-    parameters: Value,
-    inputs: Vec<NodeInput>,
-    program: PathBuf,
-}
-
-#[derive(Clone, Serialize, Deserialize)]
-struct FrozenSink {
-    stage: String,
-    parameters: Value,
-    shows: Vec<ShownPoint>,
-    left_out: Vec<FailedPoint>,
-    program: PathBuf,
+    nodes: Vec<Node<PathBuf>>,
+    sinks: Vec<Sink<PathBuf>>,
 }
 
 impl FrozenPlan {
@@ -51,21 +30,8 @@ impl FrozenPlan {
     pub fn new(plan: &Plan, out: &Path) -> Self {
         let of_nodes = plan.nodes.iter().map(|node| &node.program);
         let programs = of_nodes.chain(plan.sinks.iter().map(|sink| &sink.program));
-        let nodes = plan.nodes.iter().map(|node| FrozenNode {
-            stage: node.stage.clone(),
-            point: node.point.clone(),
-            values: node.values.clone(),
-            parameters: node.parameters.clone(),
-            inputs: node.inputs.clone(),
-            program: node.program.path.clone(),
-        });
-        let sinks = plan.sinks.iter().map(|sink| FrozenSink {
-            stage: sink.stage.clone(),
-            parameters: sink.parameters.clone(),
-            shows: sink.points.clone(),
-            left_out: sink.left_out.clone(),
-            program: sink.program.path.clone(),
-        });
+        let nodes = plan.nodes.iter().map(|n| n.clone().with_program(n.program.path.clone()));
+        let sinks = plan.sinks.iter().map(|s| s.clone().with_program(s.program.path.clone()));
         Self {
             out: out.to_path_buf(),
             devices: plan.devices.clone(),
@@ -100,7 +66,7 @@ impl FrozenPlan {
             let found = self.sinks.get(number - self.nodes.len());
             let found = found
                 .ok_or_else(|| ProgramError(format!("the submission has no task {number}")))?;
-            needed.extend(found.shows.iter().map(|shown| shown.node));
+            needed.extend(found.points.iter().map(|shown| shown.node));
             sink = Some(found.clone());
         }
         for index in (0..self.nodes.len()).rev() {
@@ -112,24 +78,23 @@ impl FrozenPlan {
         let mut programs = BTreeMap::new();
         let mut nodes = Vec::with_capacity(needed.len());
         for old_index in needed {
-            let FrozenNode { stage, point, values, parameters, mut inputs, program } =
-                self.nodes[old_index].clone();
-            for input in &mut inputs {
+            let mut node = self.nodes[old_index].clone();
+            for input in &mut node.inputs {
                 if let Origin::Node { index, .. } = &mut input.from {
                     *index = new_index[index];
                 }
             }
-            let program = self.program(&program, &mut programs)?;
+            let program = self.program(&node.program, &mut programs)?;
             new_index.insert(old_index, nodes.len());
-            nodes.push(Node { stage, point, values, parameters, inputs, program });
+            nodes.push(node.with_program(program));
         }
         let mut sinks = Vec::new();
-        if let Some(FrozenSink { stage, parameters, mut shows, left_out, program }) = sink {
-            for shown in &mut shows {
+        if let Some(mut sink) = sink {
+            for shown in &mut sink.points {
                 shown.node = new_index[&shown.node];
             }
-            let program = self.program(&program, &mut programs)?;
-            sinks.push(Sink { stage, parameters, points: shows, left_out, program });
+            let program = self.program(&sink.program, &mut programs)?;
+            sinks.push(sink.with_program(program));
         }
         Ok(Plan {
             nodes,

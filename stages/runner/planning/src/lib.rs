@@ -27,16 +27,12 @@
 
 mod arguments;
 mod axes;
-mod changes;
 mod check;
-mod confirm;
 mod expand;
 mod experiment;
 mod experiment_axes;
-mod extend;
 mod file;
 mod frozen;
-mod given_folders;
 mod key;
 mod left_out;
 mod node;
@@ -47,23 +43,21 @@ mod request;
 mod sources;
 pub mod stage_call;
 mod stages;
-mod stamp;
 mod targets;
 mod yaml_lines;
 
-pub use changes::{Change, changes, short_hash};
-pub use confirm::ConfirmError;
 pub use experiment::{Experiment, Selection, Variant};
-pub use extend::JoinError;
 pub use file::{Part, PipelineError, PipelineFile, StageBlock};
 pub use frozen::FrozenPlan;
-pub use key::{environment_parts, explain, key_parts, nearest_changes, nearest_record};
+pub use key::{
+    Change, changes, environment_parts, explain, key_parts, nearest_changes, nearest_record,
+    short_hash,
+};
 pub use node::{Devices, Node, NodeInput, Origin, Plan, ShownPoint, Sink, State};
 pub use pipeline::Pipeline;
 pub use plan::{HashedInputs, hash_inputs, read_source, stored_inputs};
 pub use quality::Quality;
 pub use request::{PlanError, Request};
-pub use sources::{Source, SourceError};
+pub use sources::{Source, SourceError, Stamp};
 pub use stages::{Describing, Programs, StageProgram, executable, is_own, own_program};
-pub use stamp::Stamp;
 pub use targets::find_targets;

@@ -6,6 +6,7 @@ use artifact::{FailedPoint, RunInput, hash_json, label};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use slurm::Resources;
+use stage::GivenInputs;
 use store::{PartialKey, Record};
 
 use crate::stages::StageProgram;
@@ -34,9 +35,9 @@ pub struct Devices {
     pub by_resources: bool,
 }
 
-/// Planned action: a stage at one point of the sweep.
-#[derive(Clone, Debug)]
-pub struct Node {
+/// Planned action: a stage at one point of the sweep. `P` refers to the program.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Node<P = Arc<StageProgram>> {
     /// Name of the stage's block.
     pub stage: String,
     /// Swept values that reach the node, such as `supersample=2`; empty without a sweep. The first
@@ -49,7 +50,7 @@ pub struct Node {
     /// Inputs, sorted by name.
     pub inputs: Vec<NodeInput>,
     /// Program of the stage.
-    pub program: Arc<StageProgram>,
+    pub program: P,
 }
 
 /// Input of a node.
@@ -76,15 +77,17 @@ pub enum Origin {
     Folder(PathBuf),
 }
 
-/// Planned sink: a stage that presents a run.
-pub struct Sink {
+/// Planned sink: a stage that presents a run. `P` refers to the program.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct Sink<P = Arc<StageProgram>> {
     /// Name of the stage's block.
     pub stage: String,
     /// Program of the stage.
-    pub program: Arc<StageProgram>,
+    pub program: P,
     /// All parameters, including defaults.
     pub parameters: Value,
     /// Points to show, each after the points of the stages that it depends on.
+    #[serde(rename = "shows")]
     pub points: Vec<ShownPoint>,
     /// Points that can't be shown because a required file is missing.
     pub left_out: Vec<FailedPoint>,
@@ -118,6 +121,22 @@ pub enum State {
     },
 }
 
+impl<P> Node<P> {
+    /// Replaces the reference to the program.
+    pub(crate) fn with_program<Q>(self, program: Q) -> Node<Q> {
+        let Self { stage, point, values, parameters, inputs, .. } = self;
+        Node { stage, point, values, parameters, inputs, program }
+    }
+}
+
+impl<P> Sink<P> {
+    /// Replaces the reference to the program.
+    pub(crate) fn with_program<Q>(self, program: Q) -> Sink<Q> {
+        let Self { stage, parameters, points, left_out, .. } = self;
+        Sink { stage, program, parameters, points, left_out }
+    }
+}
+
 impl Node {
     /// Returns stage and point as text.
     pub fn label(&self) -> String {
@@ -147,6 +166,15 @@ impl Node {
     /// Returns the indices of the nodes that produce the inputs.
     pub fn parents(&self) -> impl Iterator<Item = usize> + '_ {
         self.inputs.iter().filter_map(NodeInput::node)
+    }
+
+    /// Returns the inputs, each with the parameters of the node that produces the input; `None` for
+    /// a folder. `nodes` are all nodes of the plan.
+    pub(crate) fn given_inputs(&self, nodes: &[Self]) -> GivenInputs {
+        let inputs = self.inputs.iter();
+        inputs
+            .map(|input| (input.name.clone(), input.node().map(|i| nodes[i].parameters.clone())))
+            .collect()
     }
 
     /// Returns the inputs for the record of a run. `index_in_record` converts a node's index in the

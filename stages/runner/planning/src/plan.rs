@@ -15,7 +15,7 @@ use crate::key::key_parts;
 use crate::node::{Node, NodeInput, Origin, Plan, State};
 use crate::pipeline::Pipeline;
 use crate::request::{PlanError, Request};
-use crate::sources::{Source, SourceError};
+use crate::sources::{Source, SourceError, check_folder};
 use crate::stages::{Describing, Programs};
 
 impl Plan {
@@ -49,6 +49,27 @@ impl Plan {
     pub fn device(&self, stage: &str) -> &str {
         let has_gpu = self.resources.get(stage).is_some_and(Resources::has_gpu);
         if self.devices.by_resources && has_gpu { "cuda:0" } else { &self.devices.given }
+    }
+
+    /// Checks that all folders outside the store exist, and that they contain the files that rules
+    /// of the stages require, such as a network's weights.
+    pub fn check_folders(&self) -> Result<(), PlanError> {
+        for node in &self.nodes {
+            let mut folders: BTreeMap<String, PathBuf> = BTreeMap::new();
+            for input in &node.inputs {
+                let Origin::Folder(folder) = &input.from else { continue };
+                check_folder(folder).map_err(|e| source_error(node, &input.name, e))?;
+                folders.insert(input.name.clone(), folder.clone());
+            }
+            let inputs = node.given_inputs(&self.nodes);
+            let description = &node.program.description;
+            let missing = description.missing_files(&node.parameters, &inputs, &folders);
+            if let Some((input, problem)) = missing {
+                let folder = folders[input].clone();
+                return Err(source_error(node, input, SourceError::Folder { folder, problem }));
+            }
+        }
+        Ok(())
     }
 
     /// Returns the state of each node before a run. Fails with [`PlanError::Interrupted`] soon
@@ -186,12 +207,15 @@ pub fn read_source(
     folder: &Path,
     stop: Option<&AtomicBool>,
 ) -> Result<Source, PlanError> {
-    Source::read(store, folder, stop).map_err(|problem| match problem {
+    Source::read(store, folder, stop).map_err(|problem| source_error(node, input, problem))
+}
+
+fn source_error(node: &Node, input: &str, problem: SourceError) -> PlanError {
+    let (stage, input) = (node.stage.clone(), input.to_owned());
+    match problem {
         SourceError::Interrupted => PlanError::Interrupted,
-        problem => {
-            PlanError::Source { stage: node.stage.clone(), input: input.to_owned(), problem }
-        }
-    })
+        problem => PlanError::Source { stage, input, problem },
+    }
 }
 
 #[cfg(test)]

@@ -1,10 +1,10 @@
-use crate::stage_call::Interrupted;
 use artifact::Damage;
 use store::StoreError;
 
 use crate::experiment::Selection;
 use crate::file::PipelineError;
 use crate::sources::SourceError;
+use crate::stage_call::ProgramError;
 
 /// Targets and settings of the command line.
 #[derive(Clone, Debug, Default)]
@@ -49,8 +49,8 @@ pub enum PlanError {
     Interrupted,
 }
 
-impl From<Interrupted> for PlanError {
-    fn from(_: Interrupted) -> Self {
-        Self::Interrupted
+impl From<ProgramError> for PlanError {
+    fn from(error: ProgramError) -> Self {
+        Self::Usage(error.to_string())
     }
 }

@@ -1,7 +1,6 @@
 use std::ffi::OsStr;
 use std::fs;
 use std::os::unix::ffi::OsStrExt as _;
-use std::time::SystemTime;
 
 use super::*;
 

@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Read};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use artifact::{
     FileEntry, format_size, hash_json, list_source_files, report_line, write_atomically,
@@ -15,8 +16,6 @@ use artifact::{
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use store::Store;
-
-use crate::stamp::Stamp;
 
 /// Interval between two checks of the stop flag.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
@@ -38,6 +37,55 @@ pub enum SourceError {
     /// A signal came during hashing.
     #[error("interrupted")]
     Interrupted,
+}
+
+/// Maximum step of a file system's clock: FAT has two seconds.
+const MAX_TICK_SECONDS: u64 = 2;
+
+/// Size, times and inode of a file. If a settled stamp (`is_settled`) equals a later stamp of the
+/// file, the content is unchanged (docs/design/002).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Stamp {
+    /// Size in bytes.
+    pub(crate) size: u64,
+    /// Time of the last change of the content, as seconds and nanoseconds since 1970.
+    modified: (i64, i64),
+    /// Time of the last change of content, name, links or permissions. Programs can't set it.
+    changed: (i64, i64),
+    inode: u64,
+}
+
+impl Stamp {
+    /// Reads the stamp of a file. Links are followed.
+    pub fn of(file: &Path) -> io::Result<Self> {
+        let meta = file.metadata()?;
+        Ok(Self {
+            size: meta.len(),
+            modified: (meta.mtime(), meta.mtime_nsec()),
+            changed: (meta.ctime(), meta.ctime_nsec()),
+            inode: meta.ino(),
+        })
+    }
+
+    /// Returns whether the file wasn't touched since `earlier`. Inodes aren't compared: exFAT, SMB
+    /// and SSHFS give new ones to old files.
+    pub fn is_untouched_since(&self, earlier: &Self) -> bool {
+        Self { inode: earlier.inode, ..*self } == *earlier
+    }
+
+    /// Returns whether every later change of the file will change the stamp. A second change within
+    /// one tick of the file system's clock leaves the times unchanged.
+    pub(crate) fn is_settled(&self) -> bool {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs() as i64;
+        let times = [self.modified.0, self.changed.0];
+        times.iter().all(|time| now.abs_diff(*time) > MAX_TICK_SECONDS)
+    }
+
+    /// Returns the size and the time of the content's last change, which copies of a file may
+    /// preserve.
+    pub(crate) fn size_and_modified(&self) -> (u64, (i64, i64)) {
+        (self.size, self.modified)
+    }
 }
 
 /// Content of a folder outside the store at the time of reading.
@@ -73,7 +121,7 @@ impl Source {
         let mut notice = NOTICE_AFTER;
         loop {
             match receiver.recv_timeout(POLL_INTERVAL) {
-                Ok(result) => return result.map_err(|error| error.in_folder(folder)),
+                Ok(result) => return result.map_err(|e| in_folder(folder, e.to_string())),
                 Err(RecvTimeoutError::Disconnected) => return Err(SourceError::Interrupted),
                 Err(RecvTimeoutError::Timeout) => {}
             }
@@ -121,14 +169,15 @@ impl Source {
 
 /// Returns the absolute path of a folder. Fails if the folder doesn't exist or can't be accessed.
 pub(crate) fn check_folder(folder: &Path) -> Result<PathBuf, SourceError> {
-    let error = |problem: String| SourceError::Folder { folder: folder.to_path_buf(), problem };
-    let absolute = folder.canonicalize().map_err(|problem| {
-        error(match problem.kind() {
-            io::ErrorKind::NotFound => "no such folder; name an existing one".to_owned(),
-            _ => format!("{problem}; name another folder"),
-        })
+    let absolute = folder.canonicalize().map_err(|problem| match problem.kind() {
+        io::ErrorKind::NotFound => in_folder(folder, "no such folder; name an existing one"),
+        _ => in_folder(folder, format!("{problem}; name another folder")),
     })?;
-    if absolute.is_dir() { Ok(absolute) } else { Err(error("not a folder".to_owned())) }
+    if absolute.is_dir() { Ok(absolute) } else { Err(in_folder(folder, "not a folder")) }
+}
+
+fn in_folder(folder: &Path, problem: impl Into<String>) -> SourceError {
+    SourceError::Folder { folder: folder.to_path_buf(), problem: problem.into() }
 }
 
 /// Returns the first difference between two maps of files, as text.
@@ -169,30 +218,6 @@ impl HashProgress {
     }
 }
 
-/// Error returned when a folder's files can't be hashed.
-enum ReadError {
-    Unreadable(io::Error),
-    Changed(String),
-}
-
-impl ReadError {
-    fn in_folder(self, folder: &Path) -> SourceError {
-        let problem = match self {
-            Self::Unreadable(problem) => problem.to_string(),
-            Self::Changed(change) => {
-                format!("{change} during hashing; run again when no program writes to the folder")
-            }
-        };
-        SourceError::Folder { folder: folder.to_path_buf(), problem }
-    }
-}
-
-impl From<io::Error> for ReadError {
-    fn from(problem: io::Error) -> Self {
-        Self::Unreadable(problem)
-    }
-}
-
 /// Paths and stamps of files, by path inside a folder.
 type Listing = BTreeMap<String, (PathBuf, Stamp)>;
 
@@ -210,7 +235,7 @@ fn with_path(file: &Path, error: &io::Error) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", file.display()))
 }
 
-fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Source, ReadError> {
+fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> io::Result<Source> {
     let listing = list(folder)?;
     let mut files = cache.files();
     files.retain(|name, file| listing.get(name).is_some_and(|(_, stamp)| *stamp == file.stamp));
@@ -231,7 +256,9 @@ fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Sou
     // The hash of a file that is being written may fit no state of the file.
     let is_same = |before: &(PathBuf, Stamp), now: &(PathBuf, Stamp)| before.1 == now.1;
     if let Some(change) = first_change(&listing, &list(folder)?, is_same) {
-        return Err(ReadError::Changed(change));
+        return Err(io::Error::other(format!(
+            "{change} during hashing; run again when no program writes to the folder"
+        )));
     }
     cache.write(&files);
     Ok(Source { files })

@@ -3,14 +3,16 @@
 //! Programs in the runner's folder are its own. Any other is a user's file that a pipeline file
 //! names: only `run` starts it, and only for a needed stage. Other verbs know it by its cached
 //! description while its bytes are unchanged (docs/design/030).
+//!
+//! Before a stage's start and after its end, its program is compared with the planned one, whose
+//! code is part of the key (docs/design/002).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use crate::stage_call::{Interrupted, ProgramError, describe_all};
-use artifact::{hash_file, nearest, write_atomically};
+use artifact::{hash_file, suggestion, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use stage::{Description, Schema};
@@ -18,7 +20,9 @@ use store::Store;
 
 use crate::file::{Part, PipelineError, StageBlock};
 use crate::pipeline::Pipeline;
-use crate::stamp::Stamp;
+use crate::request::PlanError;
+use crate::sources::Stamp;
+use crate::stage_call::{ProgramError, describe_all};
 
 /// Program of a stage, with its description.
 #[derive(Debug)]
@@ -108,7 +112,7 @@ impl Programs {
         store: &Store,
         needed: &BTreeSet<String>,
         describing: Describing,
-    ) -> Result<Self, Interrupted> {
+    ) -> Result<Self, PlanError> {
         let mut cache = DescriptionCache::read(store);
         let mut descriptions: BTreeMap<PathBuf, Result<IdentifiedDescription, ProgramError>> =
             BTreeMap::new();
@@ -140,7 +144,9 @@ impl Programs {
             Describing::OwnOnly => None,
         };
         let unknown_paths: Vec<PathBuf> = unknown.keys().cloned().collect();
-        for (path, description) in describe_all(&unknown_paths, stop)? {
+        for (path, description) in
+            describe_all(&unknown_paths, stop).ok_or(PlanError::Interrupted)?
+        {
             let described = check_unchanged(&path, unknown[&path].clone(), description);
             if let Ok(described) = &described {
                 cache.0.insert(cache_key(&path), described.clone());
@@ -300,36 +306,100 @@ fn runner_folder() -> PathBuf {
 fn identify(path: &Path, name: &str) -> Result<FileIdentity, ProgramError> {
     let stamp =
         if path.is_dir() { Err(std::io::ErrorKind::IsADirectory.into()) } else { Stamp::of(path) };
-    let is_unstamped = stamp.is_err();
-    let error = match stamp {
-        Ok(stamp) if is_own(path) => return Ok(FileIdentity { stamp, blake3: None }),
-        Ok(stamp) => match hash_file(path) {
-            Ok(hash) => return Ok(FileIdentity { stamp, blake3: Some(hash) }),
-            Err(error) => error,
-        },
-        Err(error) => error,
-    };
-    let path = path.display();
-    Err(ProgramError(if is_unstamped && name.contains('/') {
-        format!("{path}: {error}; set `run:` to the stage's executable")
-    } else if is_unstamped && error.kind() == std::io::ErrorKind::NotFound {
-        let suggestion = nearest_program(name)
-            .map(|other| format!("did you mean {other}? "))
-            .unwrap_or_default();
-        format!(
-            "{path} isn't built; {suggestion}run `make build`, or set `run:` to another program"
-        )
-    } else {
-        format!("{path}: {error}")
-    }))
+    let failure = |error| ProgramError(format!("{}: {error}", path.display()));
+    let stamp = stamp.map_err(|error| {
+        if name.contains('/') {
+            failure(format!("{error}; set `run:` to the stage's executable"))
+        } else if error.kind() == std::io::ErrorKind::NotFound {
+            let suggestion = suggestion(name, own_programs().iter().map(String::as_str));
+            let remedy = "run `make build`, or set `run:` to another program";
+            ProgramError(format!("{} isn't built; {suggestion}{remedy}", path.display()))
+        } else {
+            failure(error.to_string())
+        }
+    })?;
+    if is_own(path) {
+        return Ok(FileIdentity { stamp, blake3: None });
+    }
+    let hash = hash_file(path).map_err(|error| failure(error.to_string()))?;
+    Ok(FileIdentity { stamp, blake3: Some(hash) })
 }
 
-/// Returns the program in the runner's folder whose name is most similar to an unknown name.
-fn nearest_program(name: &str) -> Option<String> {
-    let mut programs = Vec::new();
-    for entry in std::fs::read_dir(runner_folder()).ok()?.flatten() {
-        programs.extend(entry.file_name().into_string().ok().filter(|name| !name.contains('.')));
+/// Returns the names of the programs in the runner's folder.
+fn own_programs() -> Vec<String> {
+    let entries = std::fs::read_dir(runner_folder()).into_iter().flatten().flatten();
+    let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
+    names.filter(|name| !name.contains('.')).collect()
+}
+
+fn changed(path: &Path) -> PlanError {
+    let problem = "was changed or rebuilt after planning; run again";
+    PlanError::Usage(format!("{} {problem}", path.display()))
+}
+
+impl StageProgram {
+    /// Returns whether the program is in the runner's folder. Others are the user's files.
+    pub fn is_own(&self) -> bool {
+        is_own(&self.path)
     }
-    programs.sort_unstable();
-    nearest(name, programs.iter().map(String::as_str)).map(str::to_owned)
+
+    /// Checks before a stage's start that the program is the planned one. Returns the file's stamp.
+    /// Programs that this one calls are checked after the stage's end.
+    pub fn confirm(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<Stamp, PlanError> {
+        let now = self.stamp_now()?;
+        if self.stamp == Some(now) {
+            return Ok(now);
+        }
+        if let Some(planned) = &self.stamp {
+            self.check_untouched(planned, &now)?;
+        }
+        self.check_code(store, stop)?;
+        Ok(now)
+    }
+
+    /// Checks after a stage's end that the program was the planned one since the stage's start;
+    /// `start` is the file's stamp at that time. Programs outside the runner's folder are always
+    /// described again: they may call other programs.
+    pub fn confirm_since(
+        &self,
+        start: &Stamp,
+        store: &Store,
+        stop: Option<&AtomicBool>,
+    ) -> Result<(), PlanError> {
+        let now = self.stamp_now()?;
+        if now == *start && self.is_own() {
+            return Ok(());
+        }
+        self.check_untouched(start, &now)?;
+        self.check_code(store, stop)
+    }
+
+    fn stamp_now(&self) -> Result<Stamp, PlanError> {
+        let path = self.path.display();
+        Stamp::of(&self.path).map_err(|problem| PlanError::Usage(format!("{path}: {problem}")))
+    }
+
+    /// Fails if a user's file was written to: an interpreter may read a script at any time. The
+    /// runner's own programs are in memory after their start, and a build may rewrite their files
+    /// without a change of code.
+    fn check_untouched(&self, before: &Stamp, now: &Stamp) -> Result<(), PlanError> {
+        if self.is_own() || now.is_untouched_since(before) {
+            return Ok(());
+        }
+        Err(changed(&self.path))
+    }
+
+    /// Describes the program again. Fails if its code has changed.
+    fn check_code(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<(), PlanError> {
+        let path = &self.path;
+        let description = describe_all(std::slice::from_ref(path), stop)
+            .and_then(|mut descriptions| descriptions.remove(path))
+            .ok_or(PlanError::Interrupted)?;
+        if description?.code == self.description.code {
+            return Ok(());
+        }
+        // The cache knows a wrapper script by its own file, which may be unchanged.
+        DescriptionCache::forget(store, path);
+        Err(changed(path))
+    }
 }

@@ -41,9 +41,7 @@ pub fn find_targets(
             {
                 return Err(cannot_combine("their files set different qualities"));
             }
-            Some(joined) => {
-                joined.joined(found).map_err(|problem| cannot_combine(&problem.to_string()))?
-            }
+            Some(joined) => joined.joined(found).map_err(|problem| cannot_combine(&problem))?,
         });
         blocks.extend(target_blocks);
     }

@@ -1,6 +1,6 @@
 //! Encodings, merge keys and key lines of hand-written YAML files.
 //!
-//! * [`decode`]: converts a file's bytes to text, or fails with a [`DecodeError`].
+//! * [`decode`]: converts a file's bytes to text, or fails with the line of an invalid byte.
 //! * [`expand_merge_keys`]: replaces merge keys. [`find_non_finite`]: finds a number that JSON
 //!   can't represent.
 //! * [`line_of`]: line number of a key. [`line_of_duplicate`]: line number of a repeated key.
@@ -11,35 +11,15 @@
 use std::collections::BTreeSet;
 use std::fmt;
 
-use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::de::{DeserializeSeed, Deserializer, Error, MapAccess, SeqAccess, Visitor};
 use serde_yaml::Value;
 
-/// Error returned when a file isn't UTF-8 text.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{problem}")]
-pub(crate) struct DecodeError {
-    /// Line number of the first invalid byte; `None` if the whole file has another encoding.
-    pub(crate) line: Option<usize>,
-    /// Problem and remedy.
-    pub(crate) problem: &'static str,
-}
-
-/// Returns the text of a UTF-8 file without its byte order mark.
-pub(crate) fn decode(bytes: &[u8]) -> Result<&str, DecodeError> {
-    // Without a byte order mark, the first character, an ASCII one, has a zero byte.
-    let is_utf16 = bytes.starts_with(&[0xff, 0xfe])
-        || bytes.starts_with(&[0xfe, 0xff])
-        || bytes.iter().take(2).any(|b| *b == 0);
-    if is_utf16 {
-        let problem = "encoding is UTF-16; save the file as UTF-8 (iconv -f UTF-16 -t UTF-8)";
-        return Err(DecodeError { line: None, problem });
-    }
+/// Returns the text of a UTF-8 file without its byte order mark. Fails with the line number of the
+/// first invalid byte.
+pub(crate) fn decode(bytes: &[u8]) -> Result<&str, usize> {
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    std::str::from_utf8(bytes).map_err(|e| {
-        let line = 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count();
-        let problem = "encoding isn't UTF-8; save the file as UTF-8";
-        DecodeError { line: Some(line), problem }
-    })
+    std::str::from_utf8(bytes)
+        .map_err(|e| 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count())
 }
 
 /// Replaces merge keys (`<<: *anchor`) by the entries of their anchors. Returns whether the
@@ -87,87 +67,33 @@ pub(crate) fn find_non_finite(value: &Value) -> Option<Vec<String>> {
 /// so a visitor reports the wanted key as an error.
 const FOUND: &str = "key found";
 
-/// Returns the line at which a search reported its key.
-fn found_line(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
-    let error = searched.err()?;
-    error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
-}
-
 /// Returns the line number of a key, given as a path through nested mappings. If the key is
 /// missing, returns the line of the last existing key of the path.
 pub(crate) fn line_of(text: &str, path: &[&str]) -> Option<usize> {
-    (1..=path.len()).rev().find_map(|length| {
-        let search = Search(&path[..length]);
-        found_line(search.deserialize(serde_yaml::Deserializer::from_str(text)))
-    })
+    (1..=path.len()).rev().find_map(|length| find_line(text, &mut |keys| *keys == path[..length]))
 }
 
 /// Returns the line number of the first key that repeats an earlier key of its mapping.
 pub(crate) fn line_of_duplicate(text: &str) -> Option<usize> {
-    found_line(DuplicateSearch.deserialize(serde_yaml::Deserializer::from_str(text)))
+    let mut seen = BTreeSet::new();
+    find_line(text, &mut |keys| !seen.insert(keys.to_vec()))
 }
 
-/// Search for a key, given as a path through nested mappings.
-struct Search<'a>(&'a [&'a str]);
-
-impl<'de> DeserializeSeed<'de> for Search<'_> {
-    type Value = ();
-
-    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
-        deserializer.deserialize_map(self)
-    }
+/// Returns the line number of the first key whose path, of keys and indices, is wanted.
+fn find_line(text: &str, is_wanted: &mut dyn FnMut(&[String]) -> bool) -> Option<usize> {
+    let mut search = Search { path: Vec::new(), is_wanted };
+    let error = search.deserialize(serde_yaml::Deserializer::from_str(text)).err()?;
+    error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
 }
 
-impl<'de> Visitor<'de> for Search<'_> {
-    type Value = ();
-
-    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str("a mapping")
-    }
-
-    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
-        let (first, rest) = self.0.split_first().expect("a searched path has a key");
-        while let Some(is_match) = map.next_key_seed(KeyCheck(|key: &str| {
-            if key == *first && rest.is_empty() { None } else { Some(key == *first) }
-        }))? {
-            if is_match {
-                map.next_value_seed(Search(rest))?;
-            } else {
-                map.next_value::<IgnoredAny>()?;
-            }
-        }
-        Ok(())
-    }
+/// Search for a key in nested mappings and lists.
+struct Search<'a> {
+    /// Keys and indices that lead to the current value.
+    path: Vec<String>,
+    is_wanted: &'a mut dyn FnMut(&[String]) -> bool,
 }
 
-/// Check of a mapping's key: `None` ends the search at this key, `Some` continues it and returns
-/// whether the key's value is searched.
-struct KeyCheck<F>(F);
-
-impl<'de, F: FnOnce(&str) -> Option<bool>> DeserializeSeed<'de> for KeyCheck<F> {
-    type Value = bool;
-
-    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<bool, D::Error> {
-        deserializer.deserialize_str(self)
-    }
-}
-
-impl<F: FnOnce(&str) -> Option<bool>> Visitor<'_> for KeyCheck<F> {
-    type Value = bool;
-
-    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str("a key")
-    }
-
-    fn visit_str<E: Error>(self, key: &str) -> Result<bool, E> {
-        (self.0)(key).ok_or_else(|| E::custom(FOUND))
-    }
-}
-
-/// Search for a repeated key in nested mappings and lists.
-struct DuplicateSearch;
-
-impl<'de> DeserializeSeed<'de> for DuplicateSearch {
+impl<'de> DeserializeSeed<'de> for &mut Search<'_> {
     type Value = ();
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
@@ -175,7 +101,7 @@ impl<'de> DeserializeSeed<'de> for DuplicateSearch {
     }
 }
 
-impl<'de> Visitor<'de> for DuplicateSearch {
+impl<'de> Visitor<'de> for &mut Search<'_> {
     type Value = ();
 
     fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
@@ -207,19 +133,47 @@ impl<'de> Visitor<'de> for DuplicateSearch {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
-        while items.next_element_seed(DuplicateSearch)?.is_some() {}
+        for index in 0.. {
+            self.path.push(index.to_string());
+            let item = items.next_element_seed(&mut *self)?;
+            self.path.pop();
+            if item.is_none() {
+                break;
+            }
+        }
         Ok(())
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
-        let mut seen: BTreeSet<String> = BTreeSet::new();
-        while map
-            .next_key_seed(KeyCheck(|key: &str| seen.insert(key.to_owned()).then_some(false)))?
-            .is_some()
-        {
-            map.next_value_seed(DuplicateSearch)?;
+        while map.next_key_seed(Key(self))?.is_some() {
+            map.next_value_seed(&mut *self)?;
+            self.path.pop();
         }
         Ok(())
+    }
+}
+
+/// Key of a mapping, at which a search may end.
+struct Key<'a, 'b>(&'a mut Search<'b>);
+
+impl<'de> DeserializeSeed<'de> for Key<'_, '_> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_str(self)
+    }
+}
+
+impl Visitor<'_> for Key<'_, '_> {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a key")
+    }
+
+    fn visit_str<E: Error>(self, key: &str) -> Result<(), E> {
+        self.0.path.push(key.to_owned());
+        if (self.0.is_wanted)(&self.0.path) { Err(E::custom(FOUND)) } else { Ok(()) }
     }
 }
 
@@ -262,17 +216,9 @@ mod tests {
     fn only_utf8_is_decoded() {
         assert_eq!(decode(b"\xef\xbb\xbfa: 1"), Ok("a: 1"));
         assert_eq!(decode("ä: 1\r\n".as_bytes()), Ok("ä: 1\r\n"));
-        let is_refused_as_utf16 = |bytes: &[u8]| {
-            decode(bytes).unwrap_err().problem.contains("UTF-16; save the file as UTF-8")
-        };
-        assert!(
-            is_refused_as_utf16(b"\xff\xfea\0:\0")
-                && is_refused_as_utf16(b"\xfe\xff\0a\0:")
-                && is_refused_as_utf16(b"a\0:\0")
-                && is_refused_as_utf16(b"\0a\0:")
-        );
-        let DecodeError { line, problem } = decode(b"a: 1\nb: \xe4\n").unwrap_err();
-        assert!(line == Some(2) && problem.contains("save the file as UTF-8"), "{problem}");
+        for (bytes, line) in [(&b"\xff\xfea\0:\0"[..], 1), (b"a: 1\nb: \xe4\n", 2)] {
+            assert_eq!(decode(bytes), Err(line));
+        }
     }
 
     #[test]

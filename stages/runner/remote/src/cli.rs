@@ -10,8 +10,7 @@ use artifact::{Failure, bail_bad_input, print_line, report_line};
 use clap::{CommandFactory as _, Parser, Subcommand};
 use store::Store;
 
-use crate::destination::Destination;
-use crate::export::export;
+use crate::export::{Destination, export};
 use crate::import::import;
 use crate::pull::pull;
 use crate::push::push;

@@ -13,16 +13,17 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{
-    MANIFEST_FILE, Manifest, bail_bad_input, format_count, format_size, print_line, report_line,
+    Failure, MANIFEST_FILE, Manifest, bail_bad_input, file_kind, format_count, format_size,
+    json_text, print_line, report_line, sync_folder, temporary,
 };
 use serde::{Deserialize, Serialize};
 use store::{Record, Store};
+use tempfile::NamedTempFile;
 
-use crate::destination::Destination;
-use crate::intake::enter;
-use crate::progress::Progress;
+use crate::folder::{Affixes, remove_leftovers};
+use crate::intake::{protect, unprotect};
 use crate::selection::{find_unique, keys_of_artifact, records_by_key, with_history};
-use crate::transfer::{ContentCheck, STORE_REMEDY};
+use crate::transfer::{ContentCheck, Progress, STORE_REMEDY};
 
 /// Name of the first entry.
 pub(crate) const INDEX_FILE: &str = "export.json";
@@ -64,22 +65,11 @@ pub(crate) fn export(
     stop: &Arc<AtomicBool>,
 ) -> anyhow::Result<()> {
     destination.check()?;
-    // A run that lists the artifacts protects them from `gc` during the export. The run is removed
-    // afterwards, so that `gc` doesn't keep the artifacts as those of a recent run.
-    let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
-    let id = run.id().to_owned();
-    let written = History::find(store, start, records_only).and_then(|history| {
-        let entered = enter(store, stop)?;
-        for (key, record) in &history.records {
-            run.record_action(&entered, &record.stage, key)?;
-        }
-        drop(entered);
-        history.write(store, destination, stop)
-    });
-    let ended = run.end();
-    store.remove_run(&id).ok();
-    written?;
-    Ok(ended?)
+    let history = History::find(store, start, records_only)?;
+    let run = protect(store, history.records.values(), stop)?;
+    let written = history.write(store, destination, stop);
+    unprotect(store, run)?;
+    written
 }
 
 /// Artifact with the records of its history and their stored objects.
@@ -176,7 +166,7 @@ impl History {
 
 /// Writer of an archive.
 struct Writer {
-    tar: tar::Builder<BufWriter<tempfile::NamedTempFile>>,
+    tar: tar::Builder<BufWriter<NamedTempFile>>,
     /// Name of the archive in messages.
     name: String,
     progress: Progress,
@@ -184,9 +174,8 @@ struct Writer {
 
 impl Writer {
     fn write_json(&mut self, path: &str, value: &impl Serialize) -> anyhow::Result<()> {
-        let mut bytes = serde_json::to_vec_pretty(value)?;
-        bytes.push(b'\n');
-        append(&mut self.tar, path, bytes.len() as u64, bytes.as_slice())
+        let text = json_text(value)?;
+        append(&mut self.tar, path, text.len() as u64, text.as_bytes())
             .with_context(|| self.name.clone())
     }
 
@@ -254,5 +243,96 @@ impl Read for CheckedReader<'_> {
             return Err(io::Error::other("stopped"));
         }
         Ok(count)
+    }
+}
+
+/// Prefix and suffix of an unfinished archive's name.
+const TEMPORARY_AFFIXES: Affixes = (".nerf-sr-export-", ".partial");
+
+/// Path of an archive to be written.
+#[derive(Clone, Copy)]
+pub(crate) struct Destination<'a> {
+    pub(crate) file: &'a Path,
+    /// True if an existing regular file is replaced.
+    pub(crate) force: bool,
+}
+
+impl Destination<'_> {
+    fn name(&self) -> String {
+        self.file.display().to_string()
+    }
+
+    fn folder(&self) -> &Path {
+        self.file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+    }
+
+    /// Fails if the path exists and may not be replaced. Only regular files may be replaced, since
+    /// replacing a device or a link may have effects outside the folder.
+    pub(crate) fn check(&self) -> anyhow::Result<()> {
+        let name = self.name();
+        let problem = match self.file.symlink_metadata() {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            Err(error) => return Err(error).context(name),
+            Ok(found) if !found.is_file() => format!(
+                "{name} is {}; an archive replaces regular files only, choose another name",
+                file_kind(found.file_type())
+            ),
+            Ok(_) if self.force => return Ok(()),
+            Ok(_) => format!(
+                "{name}: the file exists; choose another name, or replace the file with --force"
+            ),
+        };
+        Err(Failure::Usage(problem).into())
+    }
+
+    /// Creates the temporary file that becomes the archive.
+    pub(crate) fn begin(&self) -> anyhow::Result<NamedTempFile> {
+        let folder = self.folder();
+        remove_leftovers(folder, TEMPORARY_AFFIXES);
+        let file = temporary(0o666)
+            .prefix(TEMPORARY_AFFIXES.0)
+            .suffix(TEMPORARY_AFFIXES.1)
+            .tempfile_in(folder);
+        file.with_context(|| folder.display().to_string())
+    }
+
+    /// Renames the finished archive to its destination. Without `force`, a file created there
+    /// meanwhile is kept.
+    pub(crate) fn finish(&self, archive: NamedTempFile) -> anyhow::Result<()> {
+        archive.as_file().sync_all().with_context(|| self.name())?;
+        self.check()?;
+        let renamed = if self.force {
+            archive.persist(self.file)
+        } else {
+            archive.persist_noclobber(self.file)
+        };
+        renamed.map_err(|e| e.error).with_context(|| self.name())?;
+        sync_folder(self.folder()).with_context(|| self.name())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    /// A file that is created while the archive is written is replaced only with `force`.
+    #[test]
+    fn a_file_created_meanwhile_is_kept_without_force() {
+        for force in [false, true] {
+            let dir = tempfile::tempdir().unwrap();
+            let file = dir.path().join("export.tar");
+            let destination = Destination { file: &file, force };
+            destination.check().unwrap();
+            let mut archive = destination.begin().unwrap();
+            archive.write_all(b"archive").unwrap();
+            fs::write(&file, "precious").unwrap();
+            let finished = destination.finish(archive);
+            assert_eq!(finished.is_ok(), force);
+            let expected = if force { "archive" } else { "precious" };
+            assert_eq!(fs::read_to_string(&file).unwrap(), expected);
+            assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+        }
     }
 }

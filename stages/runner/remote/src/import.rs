@@ -1,4 +1,4 @@
-use std::fmt;
+use std::fmt::Display;
 use std::fs::File;
 use std::io::{BufReader, Read, Write as _};
 use std::path::Path;
@@ -14,11 +14,8 @@ use serde_json::Value;
 use store::{Arrival, Record, Store, is_hash};
 
 use crate::export::{EXPORT_FORMAT, INDEX_FILE, Index, action_entry, object_entry};
-use crate::intake::{
-    Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, create_file, parse_record, read_manifest,
-};
-use crate::progress::Progress;
-use crate::transfer::ContentCheck;
+use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, create_file, parse_record};
+use crate::transfer::{ContentCheck, Progress};
 
 /// Maximum length of a path in an archive, in bytes; twice that of Linux.
 const MAX_PATH_BYTES: u64 = 8 << 10;
@@ -26,32 +23,8 @@ const MAX_PATH_BYTES: u64 = 8 << 10;
 const BUFFER_BYTES: usize = 1 << 18;
 const REMEDY: &str = "nothing was imported; export the artifact again from a complete store";
 
-/// Summary of an imported archive.
-#[derive(Debug)]
-pub struct Imported {
-    records: usize,
-    objects: usize,
-    /// Size of the archive in bytes.
-    bytes: u64,
-    /// Number of records that the store lacked.
-    new: usize,
-}
-
-impl fmt::Display for Imported {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let records = format_count(self.records, "record");
-        let objects = format_count(self.objects, "artifact");
-        write!(
-            f,
-            "{records} and {objects} read ({}), {}",
-            format_size(self.bytes),
-            format_count(self.new, "new record")
-        )
-    }
-}
-
-/// Imports an archive written by `export`, after verifying all of it.
-pub fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyhow::Result<Imported> {
+/// Imports an archive written by `export`, after verifying all of it. Returns a summary.
+pub fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyhow::Result<String> {
     let name = file.display().to_string();
     let (file, bytes) = open(file)?;
     let mut archive = tar::Archive::new(BufReader::with_capacity(1 << 20, file));
@@ -74,7 +47,10 @@ pub fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyhow::Res
     drop(reader);
     let new = import_all(&intake, &arrivals, records)?;
     intake.end()?;
-    Ok(Imported { records: index.actions.len(), objects: index.objects.len(), bytes, new })
+    let records = format_count(index.actions.len(), "record");
+    let objects = format_count(index.objects.len(), "artifact");
+    let new = format_count(new, "new record");
+    Ok(format!("{records} and {objects} read ({}), {new}", format_size(bytes)))
 }
 
 /// Opens an archive and returns its size in bytes. Only regular files are accepted, since a named
@@ -120,7 +96,7 @@ impl<'a, R: Read> Reader<'a, R> {
     }
 
     /// Creates the error for an invalid archive.
-    fn refuse(&self, problem: impl fmt::Display) -> anyhow::Error {
+    fn refuse(&self, problem: impl Display) -> anyhow::Error {
         Failure::BadInput(format!("{}: {problem}; {REMEDY}", self.name)).into()
     }
 
@@ -186,10 +162,7 @@ impl<'a, R: Read> Reader<'a, R> {
         let folder = self.intake.scratch(identity);
         let first = object_entry(identity, MANIFEST_FILE);
         let bytes = self.read_small(&first, MAX_MANIFEST_BYTES)?;
-        let path = folder.join(MANIFEST_FILE);
-        let written = std::fs::create_dir_all(&folder).and_then(|()| std::fs::write(&path, bytes));
-        written.with_context(|| path.display().to_string())?;
-        let manifest = read_manifest(&folder, identity, &self.entry_name(&first))?;
+        let manifest = self.intake.add_manifest(identity, &bytes, &self.entry_name(&first))?;
         for file in &manifest.files {
             let target = (!is_stored).then(|| folder.join(&file.path));
             self.read_file(identity, file, target.as_deref())?;

@@ -5,8 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use anyhow::Context as _;
 use artifact::{Damage, Failure, FileEntry, MANIFEST_FILE, Manifest, relative_path, report_line};
-use store::{Arrival, Entered, Locked, Record, RunFile, Store, is_hash};
+use store::{Arrival, Entered, Locked, Record, RunFile, Store, StoreError, is_hash};
 
 /// Maximum size of a record in bytes; usual ones have a few kilobytes. Chosen by hand.
 pub(crate) const MAX_RECORD_BYTES: u64 = 4 << 20;
@@ -33,7 +34,7 @@ pub(crate) struct Intake {
 
 impl Intake {
     pub(crate) fn begin(store: &Store, stop: &Arc<AtomicBool>) -> anyhow::Result<Self> {
-        let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
+        let run = protect(store, [], stop)?;
         let folder = store.scratch(run.id());
         Ok(Self { store: store.clone(), run: Some(run), folder, stop: Arc::clone(stop) })
     }
@@ -41,6 +42,22 @@ impl Intake {
     /// Returns the folder in which an artifact is assembled.
     pub(crate) fn scratch(&self, identity: &str) -> PathBuf {
         self.folder.join(identity)
+    }
+
+    /// Writes a manifest from a remote or an archive, called `name` in messages, to an artifact's
+    /// scratch folder, and reads it.
+    pub(crate) fn add_manifest(
+        &self,
+        identity: &str,
+        bytes: &[u8],
+        name: &str,
+    ) -> anyhow::Result<Manifest> {
+        let folder = self.scratch(identity);
+        let path = folder.join(MANIFEST_FILE);
+        fs::create_dir_all(&folder)
+            .and_then(|()| fs::write(&path, bytes))
+            .with_context(|| path.display().to_string())?;
+        Ok(read_manifest(&folder, identity, name)?)
     }
 
     /// Imports an object, if given, then its records. Returns the number of new records.
@@ -95,6 +112,29 @@ pub(crate) fn enter(store: &Store, stop: &AtomicBool) -> anyhow::Result<Entered>
     }
 }
 
+/// Begins a run that lists the actions of records, which protects them from garbage collection.
+pub(crate) fn protect<'a>(
+    store: &Store,
+    records: impl IntoIterator<Item = &'a Record>,
+    stop: &AtomicBool,
+) -> anyhow::Result<RunFile> {
+    let entered = enter(store, stop)?;
+    let run = store.begin_run(&entered, std::env::args().collect())?;
+    for record in records {
+        run.record_action(&entered, &record.stage, &record.key())?;
+    }
+    Ok(run)
+}
+
+/// Ends a run and removes it, so that garbage collection doesn't keep the actions as those of a
+/// recent run.
+pub(crate) fn unprotect(store: &Store, run: RunFile) -> Result<(), StoreError> {
+    let id = run.id().to_owned();
+    let ended = run.end();
+    store.remove_run(&id).ok();
+    ended
+}
+
 /// Parses a record from a remote or an archive, called `name` in messages. Fails if its key differs
 /// from `key`, or if `made_of` or `output`, which become parts of paths, contain anything but
 /// hashes.
@@ -115,13 +155,9 @@ pub(crate) fn parse_record(bytes: &[u8], key: &str, name: &str) -> Result<Record
     Err(Failure::BadInput(format!("{name}: {problem}")))
 }
 
-/// Reads a manifest from a remote or an archive, called `name` in messages, in a scratch folder.
-/// Fails if its identity differs, or if it contains paths that nerf-sr doesn't write.
-pub(crate) fn read_manifest(
-    folder: &Path,
-    identity: &str,
-    name: &str,
-) -> Result<Manifest, Failure> {
+/// Reads a manifest, called `name` in messages, in a scratch folder. Fails if its identity differs,
+/// or if it contains paths that nerf-sr doesn't write.
+fn read_manifest(folder: &Path, identity: &str, name: &str) -> Result<Manifest, Failure> {
     let problem = match Manifest::read(folder) {
         Err(Damage::Manifest { reason, .. }) => format!("not a manifest: {reason}"),
         Err(damage) => damage.to_string(),

@@ -12,12 +12,10 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod cli;
-mod destination;
 mod export;
 mod folder;
 mod import;
 mod intake;
-mod progress;
 mod pull;
 mod push;
 mod remote;
@@ -26,4 +24,4 @@ mod transfer;
 
 pub use cli::main;
 // Used by the fuzz target.
-pub use import::{Imported, import};
+pub use import::import;

@@ -2,18 +2,18 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use anyhow::Context as _;
 use artifact::{
-    Failure, MANIFEST_FILE, bail_bad_input, format_count, format_size, one_line, print_line,
+    Failure, MANIFEST_FILE, Manifest, bail_bad_input, format_count, format_size, one_line,
+    print_line,
 };
 use store::{Record, Store, StoreError};
 
+use crate::export::{action_entry, object_entry};
 use crate::folder::{ACTIONS, Listing};
-use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, parse_record, read_manifest};
-use crate::progress::Progress;
+use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, parse_record};
 use crate::remote::{Access, Remote};
 use crate::selection::Selection;
-use crate::transfer::{Transfer, run_all};
+use crate::transfer::{Progress, Transfer, run_all};
 
 /// Copies finished actions and their artifacts from a remote, unless the store has them.
 pub(crate) async fn pull(
@@ -30,15 +30,15 @@ pub(crate) async fn pull(
         fetch_missing_records(store, remote, selection, &signals, &mut refused).await?;
     let intake = Arc::new(Intake::begin(store, stop)?);
     let objects = fetch_manifests(&intake, remote, missing, &signals, &mut refused).await?;
-    let total = objects.iter().fold(0, |sum: u64, object| sum.saturating_add(object.bytes));
+    let total = objects.iter().fold(0, |sum: u64, object| sum.saturating_add(object.bytes()));
     drop(signals);
     let transfer = Transfer::new(remote, Progress::new("pull", total, stop));
-    let tasks = objects.into_iter().map(|object| {
-        separate_bad_input(fetch_object(Arc::clone(&intake), Arc::clone(&transfer), object))
-    });
+    let tasks = objects
+        .into_iter()
+        .map(|object| fetch_object(Arc::clone(&intake), Arc::clone(&transfer), object));
     let mut actions = 0;
     let mut bytes = 0;
-    for (new, size) in split_refused(run_all(tasks).await?, &mut refused) {
+    for (new, size) in run_accepted(tasks, &mut refused).await? {
         actions += new;
         bytes += size;
     }
@@ -84,11 +84,9 @@ async fn fetch_missing_records(
         keys.retain(|key| selection.keys.iter().any(|start| key.starts_with(start)));
     }
     let existing = count - keys.len();
-    let tasks = keys
-        .into_iter()
-        .map(|key| separate_bad_input(fetch_record(remote.clone(), Arc::clone(progress), key)));
+    let tasks = keys.into_iter().map(|key| fetch_record(remote.clone(), Arc::clone(progress), key));
     // A record is `None` if another process has removed it meanwhile.
-    let fetched = split_refused(run_all(tasks).await?, refused);
+    let fetched = run_accepted(tasks, refused).await?;
     let mut records: BTreeMap<String, Record> = fetched.into_iter().flatten().collect();
     let selected = selection.keys_among(&records, &remote.name(""))?;
     let count = selected.len();
@@ -119,20 +117,25 @@ async fn fetch_record(
     key: String,
 ) -> anyhow::Result<Option<(String, Record)>> {
     progress.add(0)?;
-    let file = format!("actions/{key}.json");
+    let file = action_entry(&key);
     let Some(bytes) = remote.read(&file, MAX_RECORD_BYTES).await? else { return Ok(None) };
     let record = parse_record(&bytes, &key, &remote.name(&file))?;
     Ok(Some((key, record)))
 }
 
-/// Artifact to pull, whose manifest is in the scratch folder.
+/// Artifact to pull.
 struct Object {
     identity: String,
     records: Vec<Record>,
-    /// Size of the files to fetch; 0 if the store has the artifact.
-    bytes: u64,
-    /// True if the store has the artifact.
-    is_stored: bool,
+    /// Manifest, which is also in the scratch folder; `None` if the store has the artifact.
+    manifest: Option<Manifest>,
+}
+
+impl Object {
+    /// Returns the size of the files to fetch.
+    fn bytes(&self) -> u64 {
+        self.manifest.as_ref().map_or(0, Manifest::size)
+    }
 }
 
 /// Fetches the manifests of the artifacts that the store lacks.
@@ -148,15 +151,10 @@ async fn fetch_manifests(
         by_output.entry(record.output.clone()).or_default().push(record);
     }
     let tasks = by_output.into_iter().map(|(identity, records)| {
-        separate_bad_input(fetch_manifest(
-            Arc::clone(intake),
-            remote.clone(),
-            Arc::clone(progress),
-            identity,
-            records,
-        ))
+        let (intake, remote) = (Arc::clone(intake), remote.clone());
+        fetch_manifest(intake, remote, Arc::clone(progress), identity, records)
     });
-    let mut objects = split_refused(run_all(tasks).await?, refused);
+    let mut objects = run_accepted(tasks, refused).await?;
     objects.sort_by(|a, b| a.identity.cmp(&b.identity));
     Ok(objects)
 }
@@ -170,19 +168,14 @@ async fn fetch_manifest(
 ) -> anyhow::Result<Object> {
     progress.add(0)?;
     if intake.store.is_complete(&identity)? {
-        return Ok(Object { identity, records, bytes: 0, is_stored: true });
+        return Ok(Object { identity, records, manifest: None });
     }
-    let file = format!("objects/{identity}/{MANIFEST_FILE}");
+    let file = object_entry(&identity, MANIFEST_FILE);
     let Some(bytes) = remote.read(&file, MAX_MANIFEST_BYTES).await? else {
         bail_bad_input!("{}: not found; push again from a complete store", remote.name(&file));
     };
-    let folder = intake.scratch(&identity);
-    let path = folder.join(MANIFEST_FILE);
-    std::fs::create_dir_all(&folder)
-        .and_then(|()| std::fs::write(&path, bytes))
-        .with_context(|| path.display().to_string())?;
-    let manifest = read_manifest(&folder, &identity, &remote.name(&file))?;
-    Ok(Object { identity, records, bytes: manifest.size(), is_stored: false })
+    let manifest = intake.add_manifest(&identity, &bytes, &remote.name(&file))?;
+    Ok(Object { identity, records, manifest: Some(manifest) })
 }
 
 /// Fetches an artifact, checks it, and imports it with its records. Returns the number of new
@@ -192,15 +185,13 @@ async fn fetch_object(
     transfer: Arc<Transfer>,
     object: Object,
 ) -> anyhow::Result<(usize, u64)> {
-    let Object { identity, records, bytes, is_stored } = object;
-    if is_stored {
-        return Ok((intake.import(None, &records)?, 0));
-    }
+    let bytes = object.bytes();
+    let Object { identity, records, manifest } = object;
+    let Some(manifest) = manifest else { return Ok((intake.import(None, &records)?, 0)) };
     let folder = intake.scratch(&identity);
-    let manifest = read_manifest(&folder, &identity, &identity)?;
     run_all(manifest.files.into_iter().map(|entry| {
         let transfer = Arc::clone(&transfer);
-        let source = format!("objects/{identity}/{}", entry.path);
+        let source = object_entry(&identity, &entry.path);
         let target = folder.join(&entry.path);
         async move { transfer.download(&source, &target, &entry).await }
     }))
@@ -209,26 +200,24 @@ async fn fetch_object(
     Ok((intake.import(Some(&arrival), &records)?, bytes))
 }
 
-/// Returns bad input as the inner error, since it doesn't affect other artifacts, and any other
-/// error as the outer one.
-async fn separate_bad_input<T>(
-    task: impl Future<Output = anyhow::Result<T>>,
-) -> anyhow::Result<anyhow::Result<T>> {
-    match task.await {
-        Ok(value) => Ok(Ok(value)),
-        Err(error) if matches!(error.downcast_ref(), Some(Failure::BadInput(_))) => Ok(Err(error)),
-        Err(error) => Err(error),
-    }
-}
-
-/// Splits the results of tasks into values and refused input.
-fn split_refused<T>(results: Vec<anyhow::Result<T>>, refused: &mut Vec<anyhow::Error>) -> Vec<T> {
+/// Runs tasks concurrently and returns their values. Bad input doesn't affect other artifacts, and
+/// is added to `refused`; any other error ends all tasks.
+async fn run_accepted<T: Send + 'static>(
+    tasks: impl Iterator<Item = impl Future<Output = anyhow::Result<T>> + Send + 'static>,
+    refused: &mut Vec<anyhow::Error>,
+) -> anyhow::Result<Vec<T>> {
+    let tasks = tasks.map(|task| async {
+        match task.await {
+            Err(error) if !matches!(error.downcast_ref(), Some(Failure::BadInput(_))) => Err(error),
+            result => Ok(result),
+        }
+    });
     let mut values = Vec::new();
-    for result in results {
+    for result in run_all(tasks).await? {
         match result {
             Ok(value) => values.push(value),
             Err(error) => refused.push(error),
         }
     }
-    values
+    Ok(values)
 }

@@ -3,14 +3,16 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{MANIFEST_FILE, Manifest, format_count, format_size, print_line, report_line};
+use artifact::{
+    MANIFEST_FILE, Manifest, format_count, format_size, json_text, print_line, report_line,
+};
 use store::{Record, Store};
 
-use crate::intake::enter;
-use crate::progress::Progress;
+use crate::export::action_entry;
+use crate::intake::{protect, unprotect};
 use crate::remote::{Access, Remote};
 use crate::selection::{Selection, records_by_key};
-use crate::transfer::{Transfer, run_all};
+use crate::transfer::{Progress, Transfer, run_all};
 
 /// Copies finished actions and their artifacts to a remote, unless it has them.
 pub(crate) async fn push(
@@ -22,21 +24,11 @@ pub(crate) async fn push(
     remote.check_format(Access::Write).await?;
     let records = records_by_key(store)?;
     let selected = selection.keys_among(&records, &store.root().display().to_string())?;
-    let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
-    let id = run.id().to_owned();
     let existing: BTreeSet<String> = remote.records().await?.keys.into_iter().collect();
     let missing: Vec<&Record> = selected.difference(&existing).map(|key| &records[key]).collect();
-    {
-        // Protects the actions from garbage collection during the push.
-        let entered = enter(store, stop)?;
-        for record in &missing {
-            run.record_action(&entered, &record.stage, &record.key())?;
-        }
-    }
+    let run = protect(store, missing.iter().copied(), stop)?;
     let pushed = push_records(store, remote, &missing, stop).await;
-    // A push must not prolong the life of artifacts.
-    run.end()?;
-    store.remove_run(&id).ok();
+    unprotect(store, run)?;
     let (actions, bytes) = pushed?;
     print_line!(
         "{}: {} pushed ({}), {} already present",
@@ -111,9 +103,8 @@ async fn push_object(
     for record in records {
         // Fails after a signal.
         transfer.progress.add(0)?;
-        let mut bytes = serde_json::to_vec_pretty(&record)?;
-        bytes.push(b'\n');
-        transfer.remote.write(&format!("actions/{}.json", record.key()), bytes).await?;
+        let text = json_text(&record)?;
+        transfer.remote.write(&action_entry(&record.key()), text.into_bytes()).await?;
     }
     Ok(())
 }

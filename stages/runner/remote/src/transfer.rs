@@ -3,15 +3,16 @@ use std::future::Future;
 use std::io::{Read as _, Write as _};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
 use artifact::{Failure, FileEntry, bail_bad_input};
 use futures_util::StreamExt as _;
 use object_store::{ObjectStoreExt as _, WriteMultipart};
+use stage::ProgressMode;
 use tokio::sync::Semaphore;
 
 use crate::intake::create_file;
-use crate::progress::Progress;
 use crate::remote::Remote;
 
 /// Maximum number of concurrent transfers, and number of threads. Chosen by hand.
@@ -21,6 +22,36 @@ pub(crate) const MAX_CONCURRENT_FILES: usize = 8;
 const MIN_PART_BYTES: u64 = 6 << 20;
 /// Maximum number of parts of a file; S3 supports 10,000.
 const MAX_PARTS: u64 = 9_000;
+
+/// Progress in bytes. [`Progress::add`] also checks for signals, because it is called after each
+/// piece of data.
+pub(crate) struct Progress {
+    bytes: stage::Progress,
+    stop: Arc<AtomicBool>,
+}
+
+impl Progress {
+    /// Creates progress of `total` bytes. With a total of 0, nothing is displayed, and only signals
+    /// are checked.
+    pub(crate) fn new(label: &str, total: u64, stop: &Arc<AtomicBool>) -> Self {
+        let mode = if total > 0 { ProgressMode::Plain } else { ProgressMode::None };
+        Self { bytes: stage::Progress::of_bytes(label, total, mode), stop: Arc::clone(stop) }
+    }
+
+    /// Counts transferred bytes. Fails if a signal has interrupted the program.
+    pub(crate) fn add(&self, bytes: u64) -> Result<(), Failure> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Err(Failure::Interrupted);
+        }
+        self.bytes.add(bytes);
+        Ok(())
+    }
+
+    /// Logs a line on stderr without disturbing the bar.
+    pub(crate) fn log(&self, line: &str) {
+        self.bytes.log_line(line);
+    }
+}
 
 /// State shared by all transfers.
 pub(crate) struct Transfer {

@@ -1,10 +1,10 @@
 use std::fs;
 use std::io;
 use std::os::unix::fs::MetadataExt as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use artifact::{
-    MANIFEST_FILE, Manifest, OutputFileError, hash_json, list_output_files, write_json,
+    Damage, MANIFEST_FILE, Manifest, hash_json, list_output_files, write_json,
     write_json_atomically,
 };
 use serde::{Deserialize, Serialize};
@@ -75,10 +75,8 @@ impl Attempt {
     /// Replaces hard links by copies, since writing to a file by its other name would change the
     /// artifact. Fails if there is anything other than folders and regular files.
     fn copy_hard_links(&self) -> Result<(), StoreError> {
-        let files = list_output_files(&self.output).map_err(|problem| match problem {
-            OutputFileError::Kind { .. } => StoreError::NoArtifact(problem.to_string()),
-            OutputFileError::Io(source) => StoreError::Io { path: self.output.clone(), source },
-        })?;
+        let files = list_output_files(&self.output)
+            .map_err(|problem| StoreError::NoArtifact(problem.to_string()))?;
         let copy = self.folder.join("copy");
         for (file, metadata) in files {
             if metadata.nlink() > 1 {
@@ -177,11 +175,57 @@ impl Store {
     }
 }
 
+/// Artifact from another store, checked in a scratch folder of this store.
+#[derive(Debug)]
+pub struct Arrival {
+    folder: PathBuf,
+    identity: String,
+    /// True if a damaged object is to be replaced.
+    replaces: bool,
+}
+
+impl Store {
+    /// Checks an artifact from another store, its files against the manifest and the manifest
+    /// against the identity, and makes it durable. Then [`Store::import_object`] is fast, unless it
+    /// replaces a damaged object, which it hashes again.
+    pub fn check_arrival(&self, folder: &Path, identity: &str) -> Result<Arrival, StoreError> {
+        let manifest = Manifest::read(folder)?;
+        if manifest.identity() != identity {
+            return Err(Damage::Content { path: folder.join(MANIFEST_FILE) }.into());
+        }
+        manifest.check_contents(folder)?;
+        make_durable(folder, &manifest)?;
+        let replaces =
+            self.object(identity).symlink_metadata().is_ok() && self.verify(identity).is_err();
+        Ok(Arrival { folder: folder.to_path_buf(), identity: identity.to_owned(), replaces })
+    }
+
+    /// Moves a checked object into place, unless the store has a complete one.
+    pub fn import_object(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
+        // An object that another process has stored meanwhile isn't hashed again.
+        let is_stored = !arrival.replaces && self.is_complete(&arrival.identity)?;
+        self.install_object(&arrival.folder, &arrival.identity, is_stored)
+    }
+
+    /// Writes a record from another store, whose object is imported first; returns whether the
+    /// record was written. An existing record stays, unless only the new one's object is complete.
+    pub fn import_record(&self, _: &Entered, record: &Record) -> Result<bool, StoreError> {
+        if let Some(existing) = self.record(&record.key())?
+            && (existing == *record
+                || self.is_complete(&existing.output)?
+                || !self.is_complete(&record.output)?)
+        {
+            return Ok(false);
+        }
+        self.write_record(record)?;
+        Ok(true)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::os::unix::fs::{PermissionsExt as _, symlink};
     use std::os::unix::net::UnixListener;
-    use std::path::Path;
 
     use super::*;
     use crate::testing::{begin, entered, finish_action};
@@ -304,6 +348,70 @@ mod tests {
         fs::write(attempt.output.join(MANIFEST_FILE), r#"{"kind":"text","schema":1,"files":[]}"#)
             .unwrap();
         assert!(matches!(store.check(attempt, "text"), Err(StoreError::NoArtifact(_))));
+        assert!(store.objects().unwrap().is_empty());
+    }
+
+    /// Writes an artifact into a scratch folder; returns the folder and the identity.
+    fn write_arrival(store: &Store, content: &str) -> (PathBuf, String) {
+        let folder = store.scratch("run").join("arriving");
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("x"), content).unwrap();
+        let manifest = Manifest::of_folder("text", &folder).unwrap();
+        write_json(&folder.join(MANIFEST_FILE), &manifest).unwrap();
+        (folder, manifest.identity())
+    }
+
+    fn record(output: &str, host: &str) -> Record {
+        Record {
+            stage: "s".to_owned(),
+            output: output.to_owned(),
+            host: host.to_owned(),
+            ..Record::default()
+        }
+    }
+
+    /// Imports an artifact and its record; returns whether the record is new, and the identity.
+    fn import_from(store: &Store, entered: &Entered, host: &str) -> (bool, String) {
+        let (folder, identity) = write_arrival(store, "1234");
+        store.import_object(entered, &store.check_arrival(&folder, &identity).unwrap()).unwrap();
+        (store.import_record(entered, &record(&identity, host)).unwrap(), identity)
+    }
+
+    #[test]
+    fn existing_records_stay_and_damaged_objects_are_replaced() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let entered = entered(&store);
+        let (is_new, identity) = import_from(&store, &entered, "first");
+        assert!(is_new);
+        assert!(!import_from(&store, &entered, "second").0);
+        let key = record("", "").key();
+        assert_eq!(store.hit(&key).unwrap().unwrap().host, "first");
+        fs::write(store.object(&identity).join("x"), "12").unwrap();
+        import_from(&store, &entered, "third");
+        store.verify(&identity).unwrap();
+        assert_eq!(store.hit(&key).unwrap().unwrap().host, "first");
+    }
+
+    #[test]
+    fn incomplete_or_changed_artifacts_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let (folder, identity) = write_arrival(&store, "1234");
+        assert!(matches!(
+            store.check_arrival(&folder, &"0".repeat(64)),
+            Err(StoreError::Damage(Damage::Content { .. }))
+        ));
+        fs::write(folder.join("x"), "1235").unwrap();
+        assert!(matches!(
+            store.check_arrival(&folder, &identity),
+            Err(StoreError::Damage(Damage::Content { .. }))
+        ));
+        fs::remove_file(folder.join("x")).unwrap();
+        assert!(matches!(
+            store.check_arrival(&folder, &identity),
+            Err(StoreError::Damage(Damage::Missing { .. }))
+        ));
         assert!(store.objects().unwrap().is_empty());
     }
 }

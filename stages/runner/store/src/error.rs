@@ -17,14 +17,12 @@ pub enum StoreError {
         source: io::Error,
     },
     /// A record, a pin or a run file has invalid content.
-    #[error("{path}: {problem}; {remedy}")]
+    #[error("{path}: {problem}")]
     Content {
         /// Path of the file.
         path: PathBuf,
-        /// Problem of the content.
+        /// Problem of the content, and remedy.
         problem: String,
-        /// Remedy.
-        remedy: String,
     },
     /// The file system doesn't support locks, the store is on several file systems, or a newer
     /// program has marked the store.

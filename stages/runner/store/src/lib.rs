@@ -34,22 +34,18 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod action;
-mod arrivals;
 mod attempt;
 mod error;
 mod folder;
 mod format;
-mod leftovers;
 mod lock;
 mod objects;
 mod run;
-mod runs;
 #[cfg(test)]
 mod testing;
 
 pub use action::{KEY_VERSION, KEY_VERSION_PART, ModelCost, Record, Unfinished};
-pub use arrivals::Arrival;
-pub use attempt::{Attempt, CheckedOutput, TimeSpent};
+pub use attempt::{Arrival, Attempt, CheckedOutput, TimeSpent};
 pub use error::{StoreError, is_lock_acquired};
 pub use folder::Store;
 pub use format::FORMAT;

@@ -12,15 +12,9 @@ use crate::folder::Store;
 /// Lock on a key, held as long as this value or a process that has inherited its [`KeyLock::file`].
 #[derive(Debug)]
 pub struct KeyLock {
-    file: File,
-}
-
-impl KeyLock {
-    /// Returns the lock's file, which the stage inherits as its standard input and reads as empty.
-    /// So the lock outlives a runner that is killed while its stage still writes.
-    pub fn file(&self) -> &File {
-        &self.file
-    }
+    /// The lock's file, which the stage inherits as its standard input and reads as empty. So the
+    /// lock outlives a runner that is killed while its stage still writes.
+    pub file: File,
 }
 
 /// Process that holds a lock, as recorded in the lock's file.
@@ -199,7 +193,7 @@ mod tests {
     fn a_lock_is_exclusive_and_dropped_with_its_last_owner() {
         let (_dir, store) = store();
         let lock = acquired(store.try_lock("k").unwrap());
-        let shared = lock.file().try_clone().unwrap();
+        let shared = lock.file.try_clone().unwrap();
         let Locked::HeldBy(Some(holder)) = store.try_lock("k").unwrap() else { panic!("not held") };
         assert_eq!((holder.pid, holder.host), (std::process::id(), host_name()));
         drop(lock);
@@ -218,7 +212,7 @@ mod tests {
         for _ in 0..2 {
             let lock = acquired(store.try_lock("k").unwrap());
             let mut text = String::new();
-            io::Read::read_to_string(&mut lock.file(), &mut text).unwrap();
+            io::Read::read_to_string(&mut &lock.file, &mut text).unwrap();
             assert_eq!(text, "");
         }
     }

@@ -34,7 +34,8 @@ pub fn write_json_atomically(path: &Path, value: &impl Serialize) -> io::Result<
     write_atomically(path, json_text(value)?.as_bytes())
 }
 
-fn json_text(value: &impl Serialize) -> io::Result<String> {
+/// Formats a value like [`write_json`].
+pub fn json_text(value: &impl Serialize) -> io::Result<String> {
     Ok(serde_json::to_string_pretty(value)? + "\n")
 }
 

@@ -35,22 +35,22 @@ mod type_words;
 
 pub use failure::{Failure, FailureExt, exit_code, one_line, permission_advice};
 pub use fsio::{
-    canonical_json, hash_json, sync_folder, temporary, write_atomically, write_json,
+    canonical_json, hash_json, json_text, sync_folder, temporary, write_atomically, write_json,
     write_json_atomically,
 };
 pub use given_input::GivenInput;
 pub use listing::{
-    ListedFiles, OutputFileError, PathError, file_kind, is_ignored_name, list_files,
-    list_output_files, list_source_files, relative_path,
+    ListedFiles, PathError, file_kind, is_ignored_name, list_files, list_output_files,
+    list_source_files, relative_path,
 };
 pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_file};
 pub use run_record::{
-    FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, label, sink_folders,
+    FailedPoint, RunInput, RunNode, RunRecord, UnfinishedNode, label, sink_folders,
 };
 pub use text::{
     WARNING, format_amount, format_count, format_duration, format_number, format_size, format_utc,
-    known_names, nearest, print_lines, print_text, printable, report_text, shortened, warnings_of,
-    with_warnings,
+    known_names, nearest, print_lines, print_text, printable, report_text, shortened, suggestion,
+    warnings_of, with_warnings,
 };
 
 /// Returns the current time in seconds since 1970.

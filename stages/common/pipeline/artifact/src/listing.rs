@@ -94,36 +94,24 @@ fn is_dangling(path: &Path) -> bool {
     is_link && fs::metadata(path).is_err_and(|error| error.kind() == ErrorKind::NotFound)
 }
 
-/// Error returned when a stage's output can't become an artifact.
-#[derive(Debug, thiserror::Error)]
-pub enum OutputFileError {
-    /// A link or a special file, whose content is elsewhere or endless.
-    #[error("{path} is {kind}; an output is a folder of folders and regular files only")]
-    Kind {
-        /// Path of the file, or of the output itself.
-        path: PathBuf,
-        /// Kind of the file, with an article.
-        kind: &'static str,
-    },
-    /// The output can't be listed.
-    #[error(transparent)]
-    Io(#[from] io::Error),
-}
-
 /// Lists the regular files of a stage's output, sorted by name. Fails if the output is not a
 /// folder, or contains anything but folders and regular files. Links are refused because they would
 /// couple the artifact to files of the user.
-pub fn list_output_files(output: &Path) -> Result<Vec<(PathBuf, Metadata)>, OutputFileError> {
+pub fn list_output_files(output: &Path) -> io::Result<Vec<(PathBuf, Metadata)>> {
     let mut files = Vec::new();
     let entries = walkdir::WalkDir::new(output).follow_root_links(false).sort_by_file_name();
     for entry in entries {
-        let entry = entry.map_err(io::Error::from)?;
+        let entry = entry?;
         let kind = entry.file_type();
         if kind.is_file() && entry.depth() > 0 {
-            let metadata = entry.metadata().map_err(io::Error::from)?;
+            let metadata = entry.metadata()?;
             files.push((entry.into_path(), metadata));
         } else if !kind.is_dir() {
-            return Err(OutputFileError::Kind { path: entry.into_path(), kind: file_kind(kind) });
+            return Err(io::Error::other(format!(
+                "{} is {}; an output is a folder of folders and regular files only",
+                entry.path().display(),
+                file_kind(kind)
+            )));
         }
     }
     Ok(files)

@@ -6,6 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::bail_bad_input;
 use crate::failure::Failure;
 use crate::given_input::GivenInput;
 
@@ -141,19 +142,6 @@ pub fn label(stage: &str, point: &str) -> String {
     if point.is_empty() { stage.to_owned() } else { format!("{stage} [{point}]") }
 }
 
-/// Error returned for a node that requires a later one.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("run.json: {stage}{} requires a later node", input_text(.input.as_deref()))]
-pub struct RunRecordError {
-    stage: String,
-    /// Input that refers to the later node; `None` for an unfinished node.
-    input: Option<String>,
-}
-
-fn input_text(input: Option<&str>) -> String {
-    input.map_or_else(String::new, |input| format!(", input {input},"))
-}
-
 /// Returns a sink's output folder for each node, ending in `/`: empty for a single node, otherwise
 /// numbered and named by the sweep's values.
 pub fn sink_folders(nodes: &[&RunNode]) -> Vec<String> {
@@ -175,23 +163,25 @@ impl RunRecord {
     /// Reads and checks `run.json` in a sink's input.
     pub fn read(input: &GivenInput) -> Result<Self, Failure> {
         let run: Self = input.read_json("run.json")?;
-        run.check().map_err(|error| Failure::BadInput(error.to_string()))?;
+        run.check()?;
         Ok(run)
     }
 
     /// Checks that all nodes refer to earlier ones only.
-    pub fn check(&self) -> Result<(), RunRecordError> {
+    pub fn check(&self) -> Result<(), Failure> {
         for (index, node) in self.nodes.iter().enumerate() {
             for (name, input) in &node.inputs {
                 if input.node.is_some_and(|parent| parent >= index) {
-                    let (stage, input) = (node.stage.clone(), Some(name.clone()));
-                    return Err(RunRecordError { stage, input });
+                    bail_bad_input!(
+                        "run.json: {}, input {name}, requires a later node",
+                        node.stage
+                    );
                 }
             }
         }
         for (index, node) in self.unfinished.iter().enumerate() {
             if node.needs.iter().any(|&needed| needed >= self.nodes.len() + index) {
-                return Err(RunRecordError { stage: node.stage.clone(), input: None });
+                bail_bad_input!("run.json: {} requires a later node", node.stage);
             }
         }
         Ok(())

@@ -144,9 +144,12 @@ pub fn known_names<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> 
     if known.is_empty() {
         return "none are known".to_owned();
     }
-    let suggestion = nearest(name, known.iter().copied())
-        .map_or_else(String::new, |name| format!("did you mean {name}? "));
-    format!("{suggestion}known: {}", known.join(", "))
+    format!("{}known: {}", suggestion(name, known.iter().copied()), known.join(", "))
+}
+
+/// Returns `did you mean NAME? ` with the most similar known name; empty without one.
+pub fn suggestion<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> String {
+    nearest(name, known).map_or_else(String::new, |name| format!("did you mean {name}? "))
 }
 
 /// Prefix of a warning on stderr, in a log and in a summary.

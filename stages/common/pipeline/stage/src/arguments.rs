@@ -104,19 +104,17 @@ pub(crate) fn read_params(
     Ok(Parameters { resolved, nested, context })
 }
 
-/// Error returned for an invalid `--device`.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("--device {0}: no such device; expected cpu, cuda or cuda:N")]
-pub struct DeviceError(String);
-
 /// Checks that `--device` is `cpu`, `cuda` or `cuda:N`. The libraries that use a GPU check that it
 /// exists.
-pub fn check_device(name: &str) -> Result<(), DeviceError> {
+pub fn check_device(name: &str) -> Result<(), Failure> {
     let is_valid = match name.strip_prefix("cuda:") {
         Some(index) => (1..=4).contains(&index.len()) && index.bytes().all(|b| b.is_ascii_digit()),
         None => ["cpu", "cuda"].contains(&name),
     };
-    if is_valid { Ok(()) } else { Err(DeviceError(name.to_owned())) }
+    if !is_valid {
+        bail_usage!("--device {name}: no such device; expected cpu, cuda or cuda:N");
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -8,9 +8,8 @@ use anyhow::Context as _;
 use artifact::{Failure, GivenInput, format_size, report_text, write_json};
 use serde::Serialize;
 
-use crate::hooks::TestHooks;
 use crate::memory::{available_memory, remaining_memory};
-use crate::progress::{Progress, ProgressMode};
+use crate::progress::{Progress, ProgressMode, TestHooks};
 
 /// Optional file of an output with a short summary, which the runner prints at the end.
 pub const SUMMARY_FILE: &str = "summary.txt";

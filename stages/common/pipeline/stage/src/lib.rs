@@ -46,43 +46,35 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod arguments;
-mod checkpoint_schedule;
 mod context;
 mod contract;
-mod help;
-mod hooks;
+mod ending;
 mod memory;
 #[cfg(test)]
 mod panic_tests;
-mod panics;
 mod parts;
 mod processors;
 mod progress;
 mod run;
 #[cfg(test)]
 mod signal_tests;
-mod signals;
 mod stage;
 mod staging;
 mod training;
 
-pub use arguments::{DeviceError, check_device};
-pub use checkpoint_schedule::CheckpointSchedule;
+pub use arguments::check_device;
 pub use context::{Context, SUMMARY_FILE};
 pub use contract::{
     ContractError, Description, GivenInputs, Input, Output, PARAMETER_GROUPS, ParameterDoc,
-    ParameterProblem, ParameterSection, Rule, Schema, group_parameters, plain,
+    ParameterProblem, ParameterSection, Rule, Schema, group_parameters, plain, render_help,
 };
-pub use help::render_help;
-pub use hooks::{SLOW_VARIABLE, STOP_VARIABLE};
+pub use ending::{install_panic_hook, stop_on_signals, stop_signals};
 pub use memory::{
     MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory_message,
     remaining_memory,
 };
-pub use panics::install_panic_hook;
-pub use processors::{ProcessorLimit, Processors, processors, start_threads};
-pub use progress::{Event, Pace, Progress, ProgressMode, join_parts};
+pub use processors::{ALL_PROCESSORS, Processors, processors, start_threads};
+pub use progress::{Event, Pace, Progress, ProgressMode, SLOW_VARIABLE, STOP_VARIABLE, join_parts};
 pub use run::{RUNNER_VARIABLE, run_stage};
-pub use signals::{stop_on_signals, stop_signals};
 pub use stage::Stage;
-pub use training::Training;
+pub use training::{CheckpointSchedule, Training};

@@ -1,4 +1,3 @@
-use std::fmt;
 use std::fs;
 
 /// Environment variables with the number of a Slurm task's or job's processors. Slurm restricts
@@ -10,33 +9,17 @@ const SLURM_VARIABLES: [&str; 2] = ["SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"]
 pub struct Processors {
     /// Number of processors, at least 1.
     pub count: usize,
-    /// Limit that gives the number.
-    pub limit: ProcessorLimit,
+    /// Limit that gives the number, as text: [`ALL_PROCESSORS`], the affinity, the quota, or an
+    /// environment variable of Slurm.
+    pub limit: &'static str,
 }
 
-/// Limit of the number of processors.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ProcessorLimit {
-    /// All processors of the machine.
-    Machine,
-    /// CPU affinity of the process, set by `taskset`, a cpuset or a batch system.
-    Affinity,
-    /// CPU quota of the process's cgroup, set by a container; rounded down.
-    Quota,
-    /// Environment variable of Slurm.
-    Slurm(&'static str),
-}
-
-impl fmt::Display for ProcessorLimit {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Machine => "all processors of this machine",
-            Self::Affinity => "the CPU affinity of this process",
-            Self::Quota => "the CPU quota of this container or cgroup",
-            Self::Slurm(variable) => variable,
-        })
-    }
-}
+/// Limit of a process that may use all processors of the machine.
+pub const ALL_PROCESSORS: &str = "all processors of this machine";
+/// Limit set by `taskset`, a cpuset or a batch system.
+const AFFINITY: &str = "the CPU affinity of this process";
+/// Limit set by a container; rounded down.
+const QUOTA: &str = "the CPU quota of this container or cgroup";
 
 /// Returns the number of processors that this process may use: the machine's, reduced to the CPU
 /// affinity, to the CPU quota of the cgroup (versions 1 and 2), and to Slurm's allocation.
@@ -66,12 +49,12 @@ fn least_limit(
     slurm: Option<(&'static str, usize)>,
 ) -> Processors {
     let limit = match slurm {
-        Some((variable, count)) if count < by_affinity_and_quota => {
-            return Processors { count, limit: ProcessorLimit::Slurm(variable) };
+        Some((limit, count)) if count < by_affinity_and_quota => {
+            return Processors { count, limit };
         }
-        _ if by_affinity_and_quota < by_affinity => ProcessorLimit::Quota,
-        _ if by_affinity_and_quota < online => ProcessorLimit::Affinity,
-        _ => ProcessorLimit::Machine,
+        _ if by_affinity_and_quota < by_affinity => QUOTA,
+        _ if by_affinity_and_quota < online => AFFINITY,
+        _ => ALL_PROCESSORS,
     };
     Processors { count: by_affinity_and_quota, limit }
 }
@@ -124,13 +107,13 @@ mod tests {
     fn the_least_limit_sets_the_number() {
         let (variable, slurm) = ("SLURM_CPUS_PER_TASK", |n| Some(("SLURM_CPUS_PER_TASK", n)));
         for (online, allowed, available, slurm, count, limit) in [
-            (8, 8, 8, None, 8, ProcessorLimit::Machine),
-            (8, 4, 4, None, 4, ProcessorLimit::Affinity),
-            (8, 8, 2, None, 2, ProcessorLimit::Quota),
-            (8, 4, 2, None, 2, ProcessorLimit::Quota),
-            (8, 8, 8, slurm(3), 3, ProcessorLimit::Slurm(variable)),
-            (8, 2, 2, slurm(3), 2, ProcessorLimit::Affinity),
-            (8, 8, 8, slurm(16), 8, ProcessorLimit::Machine),
+            (8, 8, 8, None, 8, ALL_PROCESSORS),
+            (8, 4, 4, None, 4, AFFINITY),
+            (8, 8, 2, None, 2, QUOTA),
+            (8, 4, 2, None, 2, QUOTA),
+            (8, 8, 8, slurm(3), 3, variable),
+            (8, 2, 2, slurm(3), 2, AFFINITY),
+            (8, 8, 8, slurm(16), 8, ALL_PROCESSORS),
         ] {
             assert_eq!(least_limit(online, allowed, available, slurm), Processors { count, limit });
         }

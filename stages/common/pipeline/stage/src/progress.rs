@@ -1,12 +1,11 @@
 use std::io::{IsTerminal, Write};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-use artifact::report_line;
+use artifact::{format_size, report_line};
 use serde::{Deserialize, Serialize};
-
-use crate::hooks::TestHooks;
 
 /// Format of a stage's progress reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -74,6 +73,8 @@ pub(crate) fn failed_event(message: &str) -> Option<String> {
 pub struct Progress {
     label: String,
     total: u64,
+    /// True if steps are bytes, which are reported as sizes.
+    counts_bytes: bool,
     mode: ProgressMode,
     bar: Option<indicatif::ProgressBar>,
     state: Mutex<ProgressState>,
@@ -113,11 +114,19 @@ impl Progress {
         Self {
             label: label.to_owned(),
             total,
+            counts_bytes: false,
             mode,
             bar,
             state: Mutex::new(state),
             hooks: TestHooks::default(),
         }
+    }
+
+    /// Creates progress at 0 of `total` bytes.
+    pub fn of_bytes(label: &str, total: u64, mode: ProgressMode) -> Self {
+        let mut progress = Self::new(label, total, mode);
+        progress.counts_bytes = true;
+        progress
     }
 
     /// Creates progress without reports, for tests.
@@ -149,6 +158,14 @@ impl Progress {
         self.update(|state| state.done += steps);
     }
 
+    /// Prints a line on stderr without disturbing the bar.
+    pub fn log_line(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| report_line!("{line}")),
+            None => report_line!("{line}"),
+        }
+    }
+
     fn update(&self, change: impl FnOnce(&mut ProgressState)) {
         let mut state = self.lock();
         change(&mut state);
@@ -177,9 +194,13 @@ impl Progress {
         (state.reported, state.has_reported) = (Instant::now(), true);
         let estimate = state.seconds_left;
         let left = state.pace.time_left(done, self.total, estimate);
+        let [done_text, total_text] = [done, self.total]
+            .map(|n| if self.counts_bytes { format_size(n) } else { n.to_string() });
+        let steps = format!("{done_text} of {total_text}");
         if let Some(bar) = &self.bar {
+            let sizes = if self.counts_bytes { &steps } else { "" };
             bar.set_position(done);
-            bar.set_message(join_parts(&[&state.note, &left]));
+            bar.set_message(join_parts(&[sizes, &state.note, &left]));
         } else if self.mode == ProgressMode::Json {
             Event::Progress {
                 label: self.label.clone(),
@@ -190,7 +211,6 @@ impl Progress {
             }
             .emit();
         } else {
-            let steps = format!("{done} of {}", self.total);
             report_line!("{}: {}", self.label, join_parts(&[&steps, &state.note, &left]));
         }
     }
@@ -200,6 +220,52 @@ impl Drop for Progress {
     fn drop(&mut self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
+        }
+    }
+}
+
+/// Environment variable for tests: number of finished steps at which a stage is interrupted, as if
+/// by a signal.
+pub const STOP_VARIABLE: &str = "NERF_SR_STOP_AFTER";
+
+/// Environment variable for tests, `COUNT FILE`: number of finished steps from which a stage is
+/// slowed until the file exists, so that a test can observe training in progress on any machine.
+pub const SLOW_VARIABLE: &str = "NERF_SR_SLOW_UNTIL";
+
+/// Pause of a slowed stage at each progress update. The stage still advances, so that it reaches
+/// its next checkpoint.
+const PAUSE: Duration = Duration::from_millis(500);
+
+/// Hooks of tests that interrupt or slow a stage at a given step.
+#[derive(Debug, Default)]
+pub(crate) struct TestHooks {
+    stop: Option<(u64, Arc<AtomicBool>)>,
+    slow: Option<(u64, PathBuf)>,
+}
+
+impl TestHooks {
+    /// Reads [`STOP_VARIABLE`] and [`SLOW_VARIABLE`].
+    pub(crate) fn from_environment(interrupted: &Arc<AtomicBool>) -> Self {
+        let stop = std::env::var(STOP_VARIABLE).ok().and_then(|count| count.parse().ok());
+        let slow = std::env::var(SLOW_VARIABLE).ok().and_then(|text| {
+            let (count, file) = text.split_once(' ')?;
+            Some((count.parse().ok()?, PathBuf::from(file)))
+        });
+        Self { stop: stop.map(|count| (count, Arc::clone(interrupted))), slow }
+    }
+
+    /// Interrupts or delays the stage if `done` steps have reached a hook's count.
+    pub(crate) fn apply(&self, done: u64) {
+        if let Some((count, interrupted)) = &self.stop
+            && done >= *count
+        {
+            interrupted.store(true, Ordering::Relaxed);
+        }
+        if let Some((count, file)) = &self.slow
+            && done >= *count
+            && !file.exists()
+        {
+            std::thread::sleep(PAUSE);
         }
     }
 }

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::contract::Description;
+use crate::contract::{Description, render_help};
 use anyhow::Context as _;
 use artifact::{
     Failure, FailureExt as _, GivenInput, bail_usage, exit_code, format_count, hash_json, one_line,
@@ -19,11 +19,9 @@ use serde_json::Value;
 
 use crate::arguments::{Arguments, Command, Parameters, input_folders, read_params};
 use crate::context::Context;
-use crate::help::render_help;
-use crate::panics::install_panic_hook;
+use crate::ending::{EndClaim, install_panic_hook, stop_on_signals};
 use crate::processors::{Processors, processors, start_threads};
 use crate::progress::{ProgressMode, enable_failure_event, failed_event};
-use crate::signals::{EndClaim, stop_on_signals};
 use crate::stage::Stage;
 use crate::staging::Staging;
 

@@ -4,7 +4,7 @@ mod training;
 
 use serde_json::Value;
 use store::ModelCost;
-use workload::{ExportViews, program_bytes};
+use workload::{export_bytes, export_scale, program_bytes};
 
 use super::work::{Images, Work};
 use training::{field_factor, training_memory, training_need, training_seconds};
@@ -172,12 +172,12 @@ fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
 fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let scale = match number(parameters, "size") {
         Some(width) => width / work.images.largest_size.0.max(1) as f64,
-        None => ExportViews::default_scale(work.images.pixels),
+        None => export_scale(work.images.pixels),
     };
     let pixels = (work.images.pixels as f64 * scale.powi(2)) as u64;
     let has_mesh = parameters["mesh"] == true;
     let nodes = if has_mesh { (number(parameters, "resolution")? + 1.0).powi(3) } else { 0.0 };
-    let bytes = ExportViews { pixels }.bytes(nodes as u64);
+    let bytes = export_bytes(pixels, nodes as u64);
     let ray = if work.kind.is_opaque() {
         OPAQUE_RENDERED_RAY_SECONDS
     } else {

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use artifact::{format_count, format_size, report_line};
 use planning::{PlanError, nearest_record};
 use serde_json::{Map, Value};
-use stage::{ProcessorLimit, Processors, machine_memory, processors};
+use stage::{ALL_PROCESSORS, Processors, machine_memory, processors};
 use store::Record;
 
 /// Maximum number of threads, and of stages, per core. A larger number would only cost memory and
@@ -55,7 +55,7 @@ pub(crate) struct Budget {
     pub(crate) memory: u64,
     /// Limit that makes `cores` less than the machine's number of processors, such as a cgroup;
     /// `None` if there is no such limit, or with `--threads`.
-    pub(crate) limit: Option<ProcessorLimit>,
+    pub(crate) limit: Option<&'static str>,
 }
 
 impl Budget {
@@ -73,8 +73,7 @@ impl Budget {
             stages: capped("--jobs", jobs.unwrap_or(cores.min(DEFAULT_MAX_STAGES)), cores),
             cores: capped("--threads", threads.unwrap_or(cores), cores),
             memory: memory.or_else(machine_memory).unwrap_or(u64::MAX),
-            limit: Some(limit)
-                .filter(|&limit| threads.is_none() && limit != ProcessorLimit::Machine),
+            limit: Some(limit).filter(|&limit| threads.is_none() && limit != ALL_PROCESSORS),
         })
     }
 

@@ -137,7 +137,7 @@ struct Outcome {
 type WorkerReport = (usize, Result<(Record, bool), StageFailure>);
 
 fn run_nodes(run: &Run<'_>, options: &Local) -> Outcome {
-    let display = Display::new();
+    let display = Display::default();
     let mut schedule = Schedule::new(run, options, &display);
     let (sender, reports) = mpsc::channel::<WorkerReport>();
     std::thread::scope(|scope| {

@@ -192,7 +192,7 @@ impl NodeJob<'_> {
             from_checkpoint: false,
             device: self.device(),
             threads: self.threads,
-            lock: Some(lock.file()),
+            lock: Some(&lock.file),
         };
         let stage_display = self.display.start(&label);
         let earlier = attempt.time_spent();
@@ -219,7 +219,7 @@ impl NodeJob<'_> {
         stage_display: &StageDisplay<'_>,
     ) -> (Usage, Result<(), StageFailure>) {
         let Some((watch, chain)) = &self.watch else {
-            return call.run_measured(&attempt.log, stage_display, self.run.stop);
+            return call.run(&attempt.log, stage_display, self.run.stop);
         };
         let is_over = AtomicBool::new(false);
         let scratch = self.run.store.scratch(self.run.file.id()).join(scratch_name(call.label));
@@ -227,7 +227,7 @@ impl NodeJob<'_> {
         let watching = Watching { watch, chain, label, scratch, display, is_over };
         std::thread::scope(|scope| {
             scope.spawn(|| watching.run(call));
-            let result = call.run_measured(&attempt.log, stage_display, self.run.stop);
+            let result = call.run(&attempt.log, stage_display, self.run.stop);
             is_over.store(true, Ordering::Relaxed);
             result
         })

@@ -117,7 +117,7 @@ fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
     check_parents(run.plan, &node.label(), node.parents(), &records)?;
     let parents =
         node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
-    let display = &Display::new();
+    let display = &Display::default();
     let job = NodeJob { run, node, parents, threads, display, estimate: None, watch: None };
     job.find_or_run().map(drop)
 }

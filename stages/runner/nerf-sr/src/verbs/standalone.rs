@@ -59,8 +59,7 @@ pub(crate) fn describe(
         return print_help(&program);
     }
     let needed = BTreeSet::from([stage.to_owned()]);
-    let programs = Programs::find(&pipeline, &open_store()?, &needed, Describing::OwnOnly)
-        .map_err(PlanError::from)?;
+    let programs = Programs::find(&pipeline, &open_store()?, &needed, Describing::OwnOnly)?;
     let description = &programs.require(stage).map_err(PlanError::from)?.description;
     print_lines(&format!("{}\n\n{}", description.summary, render_help(description)));
     Ok(ExitCode::SUCCESS)

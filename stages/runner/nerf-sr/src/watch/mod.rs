@@ -211,7 +211,8 @@ impl Look<'_> {
     fn call(&self, call: &Call<'_>) -> Result<Duration, StageFailure> {
         let stop = AtomicBool::new(false);
         let deadline = StopAtDeadline { look: self, stop: &stop };
-        let usage = call.run(&self.watching.scratch.join("log"), &deadline, &stop)?;
+        let (usage, result) = call.run(&self.watching.scratch.join("log"), &deadline, &stop);
+        result?;
         Ok(Duration::from_secs_f64(usage.processor_seconds))
     }
 }

@@ -107,19 +107,9 @@ pub trait Watcher: Sync {
 
 impl Call<'_> {
     /// Runs the stage, and appends its arguments, output and result to the file `log`. If `stop` is
-    /// set, the stage is asked to end, so that it can write a checkpoint.
+    /// set, the stage is asked to end, so that it can write a checkpoint. Returns the usage of a
+    /// failed stage, too.
     pub fn run(
-        &self,
-        log: &Path,
-        watcher: &dyn Watcher,
-        stop: &AtomicBool,
-    ) -> Result<Usage, StageFailure> {
-        let (usage, result) = self.run_measured(log, watcher, stop);
-        result.map(|()| usage)
-    }
-
-    /// Runs the stage as [`Self::run`] does, and also returns the usage of a failed stage.
-    pub fn run_measured(
         &self,
         log: &Path,
         watcher: &dyn Watcher,
@@ -242,14 +232,8 @@ impl Call<'_> {
         if self.from_checkpoint {
             command.arg("--from-checkpoint");
         }
-        command.args([
-            "--device",
-            self.device,
-            "--threads",
-            &self.threads.to_string(),
-            "--progress",
-            "json",
-        ]);
+        command.args(["--device", self.device, "--threads", &self.threads.to_string()]);
+        command.args(["--progress", "json"]);
         set_environment(&mut command, &self.description.environment);
         command.env(stage::RUNNER_VARIABLE, std::process::id().to_string());
         command.stdout(Stdio::piped()).stderr(Stdio::piped());

@@ -63,8 +63,8 @@ fn run(script: &str) -> (Vec<String>, Result<Usage, StageFailure>) {
         lock: None,
     };
     let watcher = Lines { lines: Mutex::default(), seen_file };
-    let result = call.run(&file("log"), &watcher, &AtomicBool::new(false));
-    (watcher.lines.into_inner().unwrap(), result)
+    let (usage, result) = call.run(&file("log"), &watcher, &AtomicBool::new(false));
+    (watcher.lines.into_inner().unwrap(), result.map(|()| usage))
 }
 
 /// A stage's peak memory includes the programs that the stage calls, but not the runner.

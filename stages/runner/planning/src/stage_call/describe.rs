@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Once, mpsc};
 use std::time::{Duration, Instant};
 
-use stage::Description;
-use stage::out_of_memory_message;
+use rayon::prelude::*;
+use stage::{Description, out_of_memory_message};
 
 use crate::stage_call::call::set_environment;
 use crate::stage_call::group::Group;
@@ -25,10 +25,6 @@ static REPORTED: Once = Once::new();
 const MAX_OUTPUT_BYTES: u64 = 1 << 24;
 /// Interval between two checks whether a program has ended; chosen by hand.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
-
-/// Error returned when `describe` was interrupted.
-#[derive(Debug, PartialEq, Eq)]
-pub struct Interrupted;
 
 /// Error returned when a stage's program can't be used or described.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -45,43 +41,11 @@ impl ProgramError {
 /// Descriptions, or the errors instead, by the program's path.
 pub type Descriptions = BTreeMap<PathBuf, Result<Description, ProgramError>>;
 
-/// Describes programs, as many in parallel as this process has processors.
-pub fn describe_all(
-    paths: &[PathBuf],
-    stop: Option<&AtomicBool>,
-) -> Result<Descriptions, Interrupted> {
-    let threads = stage::processors().count.min(paths.len());
-    let next = &AtomicUsize::new(0);
-    let (sender, receiver) = mpsc::channel();
-    let mut descriptions = Descriptions::new();
-    std::thread::scope(|scope| {
-        for _ in 0..threads {
-            let sender = sender.clone();
-            scope.spawn(move || {
-                while let Some(path) = paths.get(next.fetch_add(1, Ordering::Relaxed))
-                    && !is_set(stop)
-                {
-                    // The receiver lives as long as the scope.
-                    sender.send((path.clone(), describe(path, MAX_DESCRIBE_TIME, stop))).ok();
-                }
-            });
-        }
-        drop(sender);
-        let mut timeout = NOTICE_AFTER;
-        loop {
-            match receiver.recv_timeout(timeout) {
-                Ok((path, description)) => _ = descriptions.insert(path, description),
-                Err(mpsc::RecvTimeoutError::Timeout) => {
-                    let text = "reading the stages' descriptions (once per program version)";
-                    // A run describes users' programs several times.
-                    REPORTED.call_once(|| artifact::report_line!("{text}"));
-                    timeout = Duration::MAX;
-                }
-                Err(mpsc::RecvTimeoutError::Disconnected) => break,
-            }
-        }
-    });
-    if is_set(stop) { Err(Interrupted) } else { Ok(descriptions) }
+/// Describes programs in parallel. Returns `None` if `stop` is set.
+pub fn describe_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Option<Descriptions> {
+    let describe = |path: &PathBuf| (path.clone(), describe(path, MAX_DESCRIBE_TIME, stop));
+    let descriptions = paths.par_iter().map(describe).collect();
+    (!is_set(stop)).then_some(descriptions)
 }
 
 fn is_set(stop: Option<&AtomicBool>) -> bool {
@@ -127,10 +91,16 @@ fn run_describe(
     set_environment(&mut command, &[]);
     let (group, (stdout, stderr)) = Group::start(&mut command)?;
     let (stdout, stderr) = (read_in_background(stdout), read_in_background(stderr));
-    let deadline = Instant::now() + limit;
+    let started = Instant::now();
+    let deadline = started + limit;
     while !group.has_exited()? {
         if Instant::now() >= deadline || is_set(stop) {
             return Ok(None);
+        }
+        if started.elapsed() >= NOTICE_AFTER {
+            let text = "reading the stages' descriptions (once per program version)";
+            // A run describes users' programs several times.
+            REPORTED.call_once(|| artifact::report_line!("{text}"));
         }
         std::thread::sleep(POLL_INTERVAL);
     }
@@ -206,7 +176,7 @@ mod tests {
         }
         let path = write_program(folder.path(), "waits", "#!/bin/sh\nsleep 1000\n");
         let stop = AtomicBool::new(true);
-        assert!(matches!(describe_all(std::slice::from_ref(&path), Some(&stop)), Err(Interrupted)));
+        assert!(describe_all(std::slice::from_ref(&path), Some(&stop)).is_none());
         // Stopped while the program runs.
         assert!(describe(&path, MAX_DESCRIBE_TIME, Some(&stop)).is_err());
     }

@@ -23,17 +23,13 @@ pub struct Display {
 }
 
 impl Default for Display {
+    /// Creates a display with bars if stderr is a terminal, otherwise with lines.
     fn default() -> Self {
-        Self::new()
+        Self { bars: std::io::stderr().is_terminal().then(MultiProgress::new) }
     }
 }
 
 impl Display {
-    /// Creates a display with bars if stderr is a terminal, otherwise with lines.
-    pub fn new() -> Self {
-        Self { bars: std::io::stderr().is_terminal().then(MultiProgress::new) }
-    }
-
     /// Prints a line above the bars.
     pub fn line(&self, text: &str) {
         match &self.bars {

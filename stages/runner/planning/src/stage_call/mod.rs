@@ -16,7 +16,7 @@
 //! use planning::stage_call::{Call, Display, describe_all};
 //!
 //! let programs = [PathBuf::from("target/release/demo-scene")];
-//! let Ok(descriptions) = describe_all(&programs, None) else { return };
+//! let Some(descriptions) = describe_all(&programs, None) else { return };
 //! let [(program, Ok(description))] = &Vec::from_iter(descriptions)[..] else { return };
 //! let call = Call {
 //!     label: "demo-scene",
@@ -32,13 +32,14 @@
 //!     threads: 2,
 //!     lock: None,
 //! };
-//! let display = Display::new();
+//! let display = Display::default();
 //! let view = display.start(call.label);
-//! match call.run(Path::new("log"), &view, &AtomicBool::new(false)) {
-//!     Ok(usage) => println!("processor time: {}", usage.processor_seconds),
-//!     Err(failure) => println!("{}", failure.message),
-//! }
+//! let (usage, result) = call.run(Path::new("log"), &view, &AtomicBool::new(false));
 //! view.end();
+//! println!("processor time: {}", usage.processor_seconds);
+//! if let Err(failure) = result {
+//!     println!("{}", failure.message);
+//! }
 //! ```
 
 mod call;
@@ -49,7 +50,7 @@ mod group;
 mod log;
 
 pub use call::{Call, Usage, Watcher, read_summary};
-pub use describe::{Descriptions, Interrupted, ProgramError, describe_all};
+pub use describe::{Descriptions, ProgramError, describe_all};
 pub use display::{Display, StageDisplay};
 pub use failure::StageFailure;
 pub use group::stop_on_signals;

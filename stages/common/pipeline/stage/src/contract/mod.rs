@@ -34,7 +34,9 @@ mod values;
 mod variant_tests;
 
 pub use describe::{Description, Input, Output};
-pub use documented::{PARAMETER_GROUPS, ParameterDoc, ParameterSection, group_parameters, plain};
+pub use documented::{
+    PARAMETER_GROUPS, ParameterDoc, ParameterSection, group_parameters, plain, render_help,
+};
 pub use error::ContractError;
 pub use parameters::{ParameterProblem, Schema};
 pub use rules::{GivenInputs, Rule};

@@ -12,7 +12,7 @@ use crate::contract::validator::Validator;
 
 /// Constraint between parameters and inputs, in addition to the checks of each alone. The runner
 /// checks rules when it plans, a stage when it starts.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Rule {
     /// Conditions: parameters with JSON Schemas. The rule applies if all values match.
@@ -42,13 +42,7 @@ pub type GivenInputs = BTreeMap<String, Option<Value>>;
 impl Rule {
     /// Creates a rule that always applies and has no requirement yet.
     pub fn new(message: &str) -> Self {
-        Self {
-            when: BTreeMap::new(),
-            needs: Vec::new(),
-            must: BTreeMap::new(),
-            files: BTreeMap::new(),
-            message: message.to_owned(),
-        }
+        Self { message: message.to_owned(), ..Self::default() }
     }
 
     /// Adds a condition: the rule applies only if a parameter matches a JSON Schema.

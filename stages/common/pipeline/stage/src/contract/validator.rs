@@ -31,7 +31,16 @@ const UNSUPPORTED: [&str; 20] = [
     "uniqueItems",
     "$recursiveRef",
 ];
-const TYPES: [&str; 7] = ["array", "boolean", "integer", "null", "number", "object", "string"];
+/// JSON types with their English names.
+const TYPES: [(&str, &str); 7] = [
+    ("array", "a list"),
+    ("boolean", "true or false"),
+    ("integer", "a whole number"),
+    ("null", "null"),
+    ("number", "a number"),
+    ("object", "a mapping"),
+    ("string", "text"),
+];
 /// Maximum depth of nested schemas. No JSON value is as deep; only a schema that refers to itself
 /// exceeds it.
 const MAX_DEPTH: usize = 512;
@@ -85,7 +94,7 @@ fn check_schema(root: &Value, schema: &Value) -> Result<(), ContractError> {
     };
     for (keyword, value) in keywords {
         let is_valid = match keyword.as_str() {
-            "type" => is_type(value) || value.as_array().is_some_and(|t| t.iter().all(is_type)),
+            "type" => type_names(value).is_some(),
             "enum" | "required" | "anyOf" | "oneOf" | "allOf" | "prefixItems" => value.is_array(),
             "minimum" | "maximum" | "exclusiveMinimum" | "exclusiveMaximum" => value.is_number(),
             "multipleOf" => value.as_f64().is_some_and(|step| step > 0.0),
@@ -119,8 +128,10 @@ fn check_schema(root: &Value, schema: &Value) -> Result<(), ContractError> {
     Ok(())
 }
 
-fn is_type(name: &Value) -> bool {
-    name.as_str().is_some_and(|name| TYPES.contains(&name))
+/// Returns the types of the keyword `type`, with their English names; `None` if one is unknown.
+fn type_names(types: &Value) -> Option<Vec<(&str, &str)>> {
+    let names = types.as_array().map_or(std::slice::from_ref(types), Vec::as_slice).iter();
+    names.map(|name| TYPES.into_iter().find(|(known, _)| name == known)).collect()
 }
 
 /// Returns the schema in the same document that a `$ref` refers to.
@@ -175,15 +186,11 @@ impl<'a> Check<'a> {
 
     /// Checks `type`, `const` and `enum`.
     fn check_kind(&mut self, keywords: &Map<String, Value>, value: &Value) {
-        if let Some(types) = keywords.get("type") {
-            let names: Vec<&str> = match types {
-                Value::Array(names) => names.iter().filter_map(Value::as_str).collect(),
-                one => one.as_str().into_iter().collect(),
-            };
-            if !names.iter().any(|name| is_of_type(value, name)) {
-                let names: Vec<&str> = names.into_iter().map(type_words).collect();
-                self.report(value, format!("{value} is not {}", names.join(" or ")));
-            }
+        if let Some(types) = keywords.get("type").and_then(type_names)
+            && !types.iter().any(|(name, _)| is_of_type(value, name))
+        {
+            let names: Vec<&str> = types.into_iter().map(|(_, text)| text).collect();
+            self.report(value, format!("{value} is not {}", names.join(" or ")));
         }
         if let Some(constant) = keywords.get("const").filter(|constant| !are_equal(constant, value))
         {
@@ -325,19 +332,6 @@ fn is_of_type(value: &Value, name: &str) -> bool {
     }
 }
 
-/// Returns the English name of a JSON type.
-fn type_words(name: &str) -> &str {
-    match name {
-        "boolean" => "true or false",
-        "integer" => "a whole number",
-        "number" => "a number",
-        "string" => "text",
-        "array" => "a list",
-        "object" => "a mapping",
-        other => other,
-    }
-}
-
 /// Returns whether two values are equal; numbers compare by value, so 2 equals 2.0.
 fn are_equal(a: &Value, b: &Value) -> bool {
     match (a, b) {
@@ -354,7 +348,7 @@ fn are_equal(a: &Value, b: &Value) -> bool {
 }
 
 /// Returns the exact value of a whole number; `None` for fractions.
-fn exact_integer(number: &Number) -> Option<i128> {
+pub(crate) fn exact_integer(number: &Number) -> Option<i128> {
     /// Bound of the floats that are converted: above 64 bits, and within `i128`.
     const LIMIT: f64 = 1e36;
     if let Some(value) = number.as_u64().map(i128::from).or(number.as_i64().map(i128::from)) {

@@ -2,7 +2,7 @@
 
 use serde_json::{Number, Value};
 
-use crate::contract::validator::resolve_reference;
+use crate::contract::validator::{exact_integer, resolve_reference};
 
 /// Reader of values by a schema, whose references are resolved in `root`.
 #[derive(Clone, Copy)]
@@ -34,7 +34,7 @@ impl<'a> Reader<'a> {
                 if schemas.iter().any(|s| has_type(s, "integer"))
                     && !schemas.iter().any(|s| has_type(s, "string")) =>
             {
-                with_suffix(text).map_or_else(|| value.clone(), Value::from)
+                with_suffix(text).unwrap_or_else(|| value.clone())
             }
             Value::Array(items) => {
                 let items = items.iter().enumerate().map(|(index, item)| {
@@ -136,33 +136,19 @@ fn as_float(number: &Number, is_f32: bool) -> Option<Value> {
 
 /// Converts a float to an integer if it is whole and fits into 64 bits.
 fn as_integer(number: &Number) -> Option<Value> {
-    if !number.is_f64() {
-        return None;
-    }
-    let value = number.as_f64()?;
-    const LIMIT: f64 = 18_446_744_073_709_551_616.0; // 2^64
-    if value.fract() != 0.0 || !(-LIMIT / 2.0..LIMIT).contains(&value) {
-        return None;
-    }
-    Some(if value < 0.0 { Value::from(value as i64) } else { Value::from(value as u64) })
+    let value = exact_integer(number).filter(|_| number.is_f64())?;
+    u64::try_from(value).map(Value::from).or_else(|_| i64::try_from(value).map(Value::from)).ok()
 }
 
 /// Converts a number with the suffix k, M or G, such as `1.5M`; `None` if the result isn't whole.
-fn with_suffix(text: &str) -> Option<u64> {
-    let (digits, zeros) = [("k", 3), ("M", 6), ("G", 9)]
+fn with_suffix(text: &str) -> Option<Value> {
+    let (digits, exponent) = [("k", "e3"), ("M", "e6"), ("G", "e9")]
         .into_iter()
-        .find_map(|(suffix, zeros)| Some((text.strip_suffix(suffix)?, zeros)))?;
-    let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
-    let is_written = |part: &str| part.bytes().all(|digit| digit.is_ascii_digit());
-    // As JSON does, a number starts with a digit, and a dot is followed by one.
-    if whole.is_empty() || digits.ends_with('.') || !is_written(whole) || !is_written(fraction) {
+        .find_map(|(suffix, exponent)| Some((text.strip_suffix(suffix)?, exponent)))?;
+    if digits.contains(|c: char| !c.is_ascii_digit() && c != '.') {
         return None;
     }
-    let fraction = fraction.trim_end_matches('0');
-    if fraction.len() > zeros {
-        return None;
-    }
-    format!("{whole}{fraction:0<zeros$}").parse().ok()
+    as_integer(&serde_json::from_str(&format!("{digits}{exponent}")).ok()?)
 }
 
 #[cfg(test)]
