@@ -78,7 +78,7 @@ pub use ray::{MAX_SPEED, NormalizedRay, Ray, RayMap, clip};
 pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};
 pub use spec::Strides;
-pub use tensors::{FieldError, FieldProblem};
+pub use tensors::FieldError;
 pub use trainer::{
     NETWORK_DECAY, Phase, PhaseClock, PhaseTimes, RenderedBundles, StepReport, Supervisor, Trainer,
     TrainingError, TrainingOptions,
