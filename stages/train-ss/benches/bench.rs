@@ -324,7 +324,7 @@ impl Scene {
         while let Some(report) = trainer.step(&mut supervision)? {
             samples += report.samples;
         }
-        let done = trainer.rays_done() as f64;
+        let done = trainer.state().rays as f64;
         Ok(Trained {
             rays_per_second: done / start.elapsed().as_secs_f64(),
             samples_per_ray: samples as f64 / done,

@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use pixels::psnr_of;
-use radiance::{CurvePoint, StepReport, TrainingLog};
+use radiance::{CurvePoint, StepReport, TrainingLog, TrainingState};
 use serde::{Deserialize, Serialize};
 use stage::CheckpointSchedule;
 
@@ -47,11 +47,11 @@ impl Curve {
         last.map(|p| format!("PSNR of training pixels {:.2} dB", p.psnr)).unwrap_or_default()
     }
 
-    pub(crate) fn finish(self, steps: u64, rays: u64) -> TrainingLog {
+    pub(crate) fn finish(self, state: &TrainingState) -> TrainingLog {
         TrainingLog {
-            steps,
-            rays,
-            samples_per_ray: self.samples as f64 / rays.max(1) as f64,
+            steps: state.steps,
+            rays: state.rays,
+            samples_per_ray: self.samples as f64 / state.rays.max(1) as f64,
             curve: self.points,
             ..TrainingLog::default()
         }
@@ -97,10 +97,10 @@ impl Checkpoints {
         // The trainer is already restored. Without the supervision's state, training would neither
         // continue the earlier run nor start over.
         supervision.restore(&mut state).with_context(|| {
-            let path = folder.join(state_name(trainer.steps()));
+            let path = folder.join(state_name(trainer.state().steps));
             format!("cannot read {}; delete it to start the training over", path.display())
         })?;
-        log(&format!("resuming from step {}", trainer.steps()));
+        log(&format!("resuming from step {}", trainer.state().steps));
         Ok(curve)
     }
 
@@ -129,7 +129,7 @@ fn write(
     curve: &Curve,
 ) -> anyhow::Result<()> {
     let partial = folder.join("checkpoint.partial");
-    let step = trainer.steps();
+    let step = trainer.state().steps;
     let files = [curve_name(step), state_name(step)];
     artifact::write_json_atomically(&folder.join(&files[0]), curve)?;
     supervision.state.write(&mut std::fs::File::create(&partial)?)?;

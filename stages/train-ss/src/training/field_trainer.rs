@@ -3,7 +3,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _};
 use fields::FieldModel;
-use radiance::{Field, RayField, StepReport, Trainer, TrainingError};
+use radiance::{Field, RayField, StepReport, Trainer, TrainingState};
 use scene::Bounds;
 
 use crate::params::{Resolved, ResolvedField};
@@ -15,10 +15,8 @@ pub(crate) trait FieldTrainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>>;
     /// Returns the current field.
     fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>>;
-    /// Returns the number of steps taken.
-    fn steps(&self) -> u64;
-    /// Returns the number of rays cast.
-    fn rays_done(&self) -> u64;
+    /// Returns the progress of the training.
+    fn state(&self) -> &TrainingState;
     /// Returns the step of a checkpoint; `None` if the checkpoint is incomplete.
     fn checkpoint_step(&self, path: &Path) -> Option<u64>;
     /// Writes a checkpoint.
@@ -112,12 +110,8 @@ pub(crate) fn average_weights(
 /// Implements the methods of [`FieldTrainer`] that all trainers have under the same names.
 macro_rules! forwarded {
     () => {
-        fn steps(&self) -> u64 {
-            Self::steps(self)
-        }
-
-        fn rays_done(&self) -> u64 {
-            Self::rays_done(self)
+        fn state(&self) -> &TrainingState {
+            Self::state(self)
         }
 
         fn checkpoint_step(&self, path: &Path) -> Option<u64> {
@@ -136,9 +130,7 @@ macro_rules! forwarded {
 
 impl FieldTrainer for Trainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
-        Self::step(self, supervision).map_err(|e| match e {
-            TrainingError::NotFinite { .. } => Failure::Numerical(e.to_string()).into(),
-        })
+        Self::step(self, supervision).map_err(|e| Failure::Numerical(e.to_string()).into())
     }
 
     fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>> {
@@ -148,7 +140,7 @@ impl FieldTrainer for Trainer {
     forwarded!();
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        let steps = Self::steps(&self);
+        let steps = Self::state(&self).steps;
         write_grid(Self::finish(*self), steps, weights)
     }
 }
@@ -178,7 +170,7 @@ impl FieldTrainer for torch_field::GridTrainer {
     forwarded!();
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        write_grid(self.field()?, Self::steps(&self), weights)
+        write_grid(self.field()?, Self::state(&self).steps, weights)
     }
 }
 

@@ -109,7 +109,7 @@ impl<'a> Member<'a> {
         let curve = read_latest(work, &mut *trainer).ok_or_else(|| {
             Failure::BadInput(format!("--work {}: no complete checkpoint yet", work.display()))
         })?;
-        let log = curve.finish(trainer.steps(), trainer.rays_done());
+        let log = curve.finish(trainer.state());
         self.write_weights(trainer, bounds)?;
         Ok(log)
     }
@@ -212,10 +212,10 @@ impl<'a> Member<'a> {
             if report.skipped {
                 self.context.log_line(format!(
                     "step {}: a value was not finite; step discarded, learning rates halved",
-                    trainer.steps()
+                    trainer.state().steps
                 ));
             }
-            let rays = trainer.rays_done();
+            let rays = trainer.state().rays;
             if let Some(difference) = supervision.exposure_difference(rays as f64 / total as f64) {
                 if difference.is_clear() || difference.is_last() {
                     self.context.log_line(difference.to_string());
@@ -232,7 +232,7 @@ impl<'a> Member<'a> {
                 remaining: total.saturating_sub(rays),
                 further: data.total_rays.saturating_sub(self.rays_before + total),
             };
-            data.progress.set_seconds_left(time_left.seconds(trainer.steps(), rays_left));
+            data.progress.set_seconds_left(time_left.seconds(trainer.state().steps, rays_left));
             data.progress.set(self.rays_before + rays, &curve.last_psnr());
         }
     }
@@ -240,7 +240,7 @@ impl<'a> Member<'a> {
     /// Ends a training: writes the weights, and stores weights and log for a later run.
     fn finish(&self, training: Training, bounds: Bounds) -> anyhow::Result<TrainingLog> {
         let Training { trainer, supervision, curve, .. } = training;
-        let mut log = curve.finish(trainer.steps(), trainer.rays_done());
+        let mut log = curve.finish(trainer.state());
         if let Some(motion) = supervision.mean_motion(|| trainer.field())? {
             self.context.log_line(format!("cameras have {motion}"));
             if motion.exceeds_usual_error() {

@@ -73,15 +73,15 @@ pub use field::Field;
 pub use math::spherical_harmonics;
 pub use occupancy::{CellHit, Occupancy};
 pub use passes::Passes;
-pub use points::{PointField, PointSample, PointSamples};
+pub use points::{PointField, PointSamples};
 pub use ray::{MAX_SPEED, NormalizedRay, Ray, RayMap, clip};
 pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};
 pub use spec::Strides;
 pub use tensors::FieldError;
 pub use trainer::{
-    NETWORK_DECAY, Phase, PhaseClock, PhaseTimes, RenderedBundles, StepReport, Supervisor, Trainer,
-    TrainingError, TrainingOptions,
+    NETWORK_DECAY, Phase, PhaseClock, PhaseTimes, RenderedBundles, Step, StepReport, Supervisor,
+    Trainer, TrainingError, TrainingOptions,
 };
 pub use training_log::{CurvePoint, TRAINING_FILE, TrainingLog};
 pub use training_state::TrainingState;

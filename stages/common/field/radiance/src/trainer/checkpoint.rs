@@ -12,8 +12,7 @@ impl Trainer {
     /// Writes a checkpoint from which a resumed training ends in the same bytes. Not atomic: the
     /// caller renames the file.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), FieldError> {
-        let [steps, bundles, rays, scale, fault] = self.state.counters();
-        let counters = [steps, bundles, rays, scale, fault, self.samples_per_ray.to_bits()];
+        let counters = self.state.counters();
         let occupied = self.field.occupancy.to_bytes();
         let density = self.field.occupancy.densities();
         let mut tensors = vec![
@@ -41,7 +40,7 @@ impl Trainer {
     /// is unchanged.
     pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
         read_tensors(path, |tensors| {
-            let [state @ .., samples_per_ray] = read_counters(tensors)?;
+            let state = TrainingState::from_counters(read_counters(tensors)?);
             let field = &mut self.field;
             let mut moments = ParameterBuffers::zeros(field);
             read_tensor(tensors, "moments.grid", Dtype::U32, &mut moments.grid)?;
@@ -57,8 +56,7 @@ impl Trainer {
             (self.moments, self.average) = (moments, average);
             (field.grid, field.network) = (weights.grid, weights.network);
             field.occupancy.restore(density, &occupied);
-            self.state = TrainingState::from_counters(state);
-            self.samples_per_ray = f64::from_bits(samples_per_ray);
+            self.state = state;
             Ok(())
         })
     }
