@@ -109,9 +109,13 @@ impl Supersampling {
         [block_start(pixel.x, columns, hr.width), block_start(pixel.y, rows, hr.height)]
     }
 
-    /// Restores the state that [`SupervisionState::write`] wrote.
-    pub(crate) fn restore(&mut self, from: &mut impl io::Read) -> io::Result<()> {
-        self.state.restore(from)?;
+    /// Restores the state of a checkpoint, see [`SupervisionState::restore`].
+    pub(crate) fn restore(
+        &mut self,
+        saved: SupervisionState,
+        from: &mut impl io::Read,
+    ) -> io::Result<()> {
+        self.state.restore(saved, from)?;
         self.update_rays();
         Ok(())
     }
@@ -754,7 +758,7 @@ mod tests {
             assert!(joined.loss_and_gradient(bundle, &colours, &mut gradients).is_finite());
             record_colours(&mut joined, bundle, &colours);
         }
-        assert_eq!(joined.state.byte_length(), 3 * (2 * 2 + 5 * 3));
+        assert_eq!(joined.state.cache.unwrap().byte_length(), 3 * (2 * 2 + 5 * 3));
     }
 
     #[test]

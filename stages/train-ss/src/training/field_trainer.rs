@@ -17,12 +17,9 @@ pub(crate) trait FieldTrainer {
     fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>>;
     /// Returns the progress of the training.
     fn state(&self) -> &TrainingState;
-    /// Returns the step of a checkpoint; `None` if the checkpoint is incomplete.
-    fn checkpoint_step(&self, path: &Path) -> Option<u64>;
     /// Writes a checkpoint.
     fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()>;
-    /// Resumes from a checkpoint and returns whether that succeeded. On failure the trainer is
-    /// unchanged, unless libtorch failed.
+    /// Resumes from a checkpoint and returns whether that succeeded.
     fn resume(&mut self, path: &Path) -> bool;
     /// Ends the training and writes the field's weights.
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()>;
@@ -112,10 +109,6 @@ macro_rules! forwarded {
     () => {
         fn state(&self) -> &TrainingState {
             Self::state(self)
-        }
-
-        fn checkpoint_step(&self, path: &Path) -> Option<u64> {
-            Self::checkpoint_step(path).ok()
         }
 
         fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {

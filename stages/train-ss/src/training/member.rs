@@ -181,10 +181,9 @@ impl<'a> Member<'a> {
         }
         // While cameras move, their silhouettes would empty wrong cells.
         let cells = cells.filter(|_| !params.pose_refinement);
-        let mut trainer = self.new_trainer(views.bounds, cells)?;
         let checkpoints = Checkpoints::new(work);
-        let curve = checkpoints
-            .resume(&mut *trainer, &mut supervision, |text| self.context.log_line(text))?;
+        let new_trainer = || self.new_trainer(views.bounds, cells);
+        let (trainer, curve) = checkpoints.resume(new_trainer, &mut supervision, log)?;
         Ok(Training { trainer, supervision, checkpoints, curve })
     }
 

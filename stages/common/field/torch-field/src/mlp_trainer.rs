@@ -235,12 +235,6 @@ impl MlpTrainer {
         Ok(self.adam.write_checkpoint(path, self.field.named_parameters(), &counters)?)
     }
 
-    /// Reads the step at which a checkpoint was written.
-    pub fn checkpoint_step(path: &Path) -> Result<u64, TorchFieldError> {
-        let [steps, ..] = Adam::counts_of_checkpoint::<7>(path)?;
-        Ok(steps)
-    }
-
     /// Resumes from a checkpoint of a trainer with the same field and options.
     pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
         let (adam, [counters @ .., stuck_steps]): (Adam, [u64; 7]) =

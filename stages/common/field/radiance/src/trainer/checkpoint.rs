@@ -31,16 +31,12 @@ impl Trainer {
         write_tensors(path, &tensors)
     }
 
-    /// Returns the step at which a checkpoint was written.
-    pub fn checkpoint_step(path: &Path) -> Result<u64, FieldError> {
-        read_tensors(path, |tensors| Ok(read_counters(tensors)?[0]))
-    }
-
     /// Resumes from a checkpoint of a trainer with the same field and options. On error the trainer
     /// is unchanged.
     pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
         read_tensors(path, |tensors| {
-            let state = TrainingState::from_counters(read_counters(tensors)?);
+            let mut counters = [0; 6];
+            read_tensor(tensors, "counters", Dtype::U64, &mut counters)?;
             let field = &mut self.field;
             let mut moments = ParameterBuffers::zeros(field);
             read_tensor(tensors, "moments.grid", Dtype::U32, &mut moments.grid)?;
@@ -56,7 +52,7 @@ impl Trainer {
             (self.moments, self.average) = (moments, average);
             (field.grid, field.network) = (weights.grid, weights.network);
             field.occupancy.restore(density, &occupied);
-            self.state = state;
+            self.state = TrainingState::from_counters(counters);
             Ok(())
         })
     }
@@ -72,11 +68,4 @@ fn read_parameters(
     read_tensor(tensors, &format!("{prefix}grid"), Dtype::F32, &mut parameters.grid)?;
     read_tensor(tensors, &format!("{prefix}network"), Dtype::F32, &mut parameters.network)?;
     Ok(parameters)
-}
-
-/// Reads a checkpoint's six counters.
-fn read_counters(tensors: &SafeTensors<'_>) -> Result<[u64; 6], String> {
-    let mut counters = [0; 6];
-    read_tensor(tensors, "counters", Dtype::U64, &mut counters)?;
-    Ok(counters)
 }
