@@ -120,11 +120,6 @@ impl Supersampling {
         Ok(())
     }
 
-    /// Returns the first I/O error of the pixel file, if any.
-    pub(crate) fn first_error(&self) -> Option<&io::Error> {
-        self.memory.first_error()
-    }
-
     /// Moves cameras towards the poses at which the field's renders fit the photographs, if pose
     /// refinement is enabled and its next round is due. `field` is only called then.
     pub(crate) fn refine_poses<'a>(
@@ -667,7 +662,7 @@ mod tests {
                 Some(photograph_of_size(&camera, "a", width, height)),
                 &options(kind, 2.0),
             );
-            assert_eq!(joined.sampler.index_count(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
+            assert_eq!(joined.sampler.index_count, 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
             let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
             let mut has_ray = [false; 72];
             for bundle in 0..800 {
@@ -728,7 +723,7 @@ mod tests {
             Some(photograph_of_size(&camera, "a", 20, 16)),
             &options(Supervision::Kernel, 2.0),
         );
-        assert_eq!(larger.sampler.index_count(), 20 + 80);
+        assert_eq!(larger.sampler.index_count, 20 + 80);
         let mut masked = truth;
         masked.data[..3].fill(f32::NAN);
         let means = block_means(&masked, [2, 2]);

@@ -201,7 +201,7 @@ impl<'a> Member<'a> {
             let is_interrupted = self.context.is_interrupted();
             checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
             let Some(report) = trainer.step(supervision)? else { return Ok(Outcome::Complete) };
-            if let Some(error) = supervision.first_error() {
+            if let Some(error) = supervision.memory.first_error() {
                 let folder = self.pixel_folder().display();
                 anyhow::bail!(
                     "cannot read or write the training pixels in {folder}: {error}; check the \
