@@ -43,8 +43,8 @@ impl Passes {
         for rays in rays.chunks(CHUNK_RAYS) {
             let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
             self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Single);
-            samples[0] += self.chunk.samples();
-            samples[1] += self.chunk.coloured_samples();
+            samples[0] += self.chunk.samples.count;
+            samples[1] += self.chunk.counted.sample.len();
             if backward {
                 let ones = [[1.0; 3]; CHUNK_RAYS];
                 let upstream = RayGradients {

@@ -93,8 +93,9 @@ impl ShardResult {
         worker.offsets.clear();
         worker.offsets.extend((0..ray_count as u64).map(|r| options.offset(first_ray + r)));
         worker.chunk.forward(field, &worker.clipped, &worker.offsets, work.strides);
-        self.samples += worker.chunk.samples();
-        worker.chunk.list_hits(field.march_step(), &mut self.hits);
+        let Chunk { samples, counted, .. } = &worker.chunk;
+        self.samples += samples.count;
+        samples.list_hits(counted, field.march_step(), &mut self.hits);
         for (r, sum) in worker.chunk.sums.iter().enumerate() {
             let background = worker.backgrounds[r];
             worker.colours[r] =
