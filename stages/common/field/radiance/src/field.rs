@@ -132,7 +132,7 @@ impl Field {
         bounds: Bounds,
     ) -> Result<Self, FieldError> {
         read_tensors(path, |tensors| {
-            architecture.check().map_err(|problem| problem.to_string())?;
+            architecture.check().map_err(|error| error.0)?;
             if !bounds.is_valid() {
                 return Err(format!("bounds {bounds:?} are empty or not finite"));
             }

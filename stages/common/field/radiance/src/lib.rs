@@ -68,7 +68,7 @@ mod trainer;
 mod training_log;
 mod training_state;
 
-pub use architecture::{Architecture, CELLS_PER_PIXEL, GivenSizes, OutOfRange, check_ranges};
+pub use architecture::{Architecture, CELLS_PER_PIXEL, DescriptionError, GivenSizes, check_ranges};
 pub use field::Field;
 pub use math::spherical_harmonics;
 pub use occupancy::{CellHit, Occupancy};
