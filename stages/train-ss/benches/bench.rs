@@ -441,10 +441,9 @@ fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()>
     let ResolvedField::Mlp { architecture, density_noise_std } = &params.field else {
         anyhow::bail!("MLPs are measured here");
     };
-    nets::deterministic();
     let mut supervision = supervision(input, &params)?;
-    let field =
-        torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
+    let device = fields::torch_device("cpu")?;
+    let field = torch_field::Mlp::new(*architecture, views.bounds, params.seed, device)?;
     let weights = field.parameter_count() / 2;
     let mut trainer = torch_field::MlpTrainer::new(field, params.mlp_training(*density_noise_std))?;
     trainer.step(&mut supervision)?;

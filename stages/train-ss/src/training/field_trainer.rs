@@ -2,7 +2,6 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _};
-use fields::FieldModel;
 use radiance::{Field, RayField, StepReport, Trainer, TrainingState};
 use scene::Bounds;
 
@@ -21,8 +20,9 @@ pub(crate) trait FieldTrainer {
     fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()>;
     /// Resumes from a checkpoint and returns whether that succeeded.
     fn resume(&mut self, path: &Path) -> bool;
-    /// Ends the training and writes the field's weights.
-    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()>;
+    /// Ends the training and writes the field's weights, or their mean with those of a file `init`
+    /// (design note 020).
+    fn finish(self: Box<Self>, weights: &Path, init: Option<&Path>) -> anyhow::Result<()>;
 }
 
 /// Creates a trainer of a new field, or of one initialised from the weights `init`. A grid is
@@ -77,32 +77,7 @@ pub(crate) fn new_trainer(
     }
 }
 
-/// Replaces trained weights by their mean with the initial ones (design note 020).
-pub(crate) fn average_weights(
-    model: FieldModel,
-    bounds: Bounds,
-    init: &Path,
-    trained: &Path,
-) -> anyhow::Result<()> {
-    match model {
-        FieldModel::Grid(architecture) => {
-            let mut field = Field::read(trained, architecture, bounds)?;
-            field.average_with(&Field::read(init, architecture, bounds)?);
-            field.write(trained)?;
-        }
-        #[cfg(feature = "torch")]
-        FieldModel::Mlp(architecture) => {
-            let device = nets::device("cpu")?;
-            let field = torch_field::Mlp::read(trained, architecture, bounds, device)?;
-            field.average_with(&torch_field::Mlp::read(init, architecture, bounds, device)?)?;
-            field.write(trained)?;
-        }
-        // `new_trainer` has refused to train MLPs.
-        #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {}
-    }
-    Ok(())
-}
+const CANNOT_AVERAGE: &str = "cannot average the weights";
 
 /// Implements the methods of [`FieldTrainer`] that all trainers have under the same names.
 macro_rules! forwarded {
@@ -132,14 +107,20 @@ impl FieldTrainer for Trainer {
 
     forwarded!();
 
-    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
+    fn finish(self: Box<Self>, weights: &Path, init: Option<&Path>) -> anyhow::Result<()> {
         let steps = Self::state(&self).steps;
-        write_grid(Self::finish(*self), steps, weights)
+        write_grid(Self::finish(*self), steps, weights, init)
     }
 }
 
-/// Writes a grid without its specks; fails if a parameter isn't finite.
-fn write_grid(mut field: Field, steps: u64, weights: &Path) -> anyhow::Result<()> {
+/// Writes a grid without its specks, averaged with the weights `init`; fails if a parameter isn't
+/// finite.
+fn write_grid(
+    mut field: Field,
+    steps: u64,
+    weights: &Path,
+    init: Option<&Path>,
+) -> anyhow::Result<()> {
     if !field.is_finite() {
         return Err(Failure::Numerical(format!(
             "step {steps}: a parameter is not finite; lower the learning rate"
@@ -147,6 +128,10 @@ fn write_grid(mut field: Field, steps: u64, weights: &Path) -> anyhow::Result<()
         .into());
     }
     field.remove_specks();
+    if let Some(init) = init {
+        let init = Field::read(init, field.architecture, field.bounds);
+        field.average_with(&init.context(CANNOT_AVERAGE)?);
+    }
     field.write(weights).context("cannot write the field")
 }
 
@@ -162,8 +147,8 @@ impl FieldTrainer for torch_field::GridTrainer {
 
     forwarded!();
 
-    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        write_grid(self.field()?, Self::state(&self).steps, weights)
+    fn finish(self: Box<Self>, weights: &Path, init: Option<&Path>) -> anyhow::Result<()> {
+        write_grid(Self::field(&self)?, Self::state(&self).steps, weights, init)
     }
 }
 
@@ -190,8 +175,12 @@ impl FieldTrainer for torch_field::MlpTrainer {
 
     forwarded!();
 
-    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        Self::field(&self).write(weights).context("cannot write the field")
+    fn finish(self: Box<Self>, weights: &Path, init: Option<&Path>) -> anyhow::Result<()> {
+        let field = Self::field(&self);
+        if let Some(init) = init {
+            field.average_with(init).context(CANNOT_AVERAGE)?;
+        }
+        field.write(weights).context("cannot write the field")
     }
 }
 
@@ -222,7 +211,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("field.safetensors");
         let Field { architecture, bounds, .. } = field();
-        write_grid(field(), 7, &path).unwrap();
+        write_grid(field(), 7, &path, None).unwrap();
         let read = Field::read(&path, architecture, bounds).unwrap();
         let (.., occupancy) = read.parts();
         let cells = occupancy.to_bytes();
@@ -236,7 +225,7 @@ mod tests {
         let path = folder.path().join("field.safetensors");
         let mut field = field();
         field.parts_mut().0[3] = f32::NAN;
-        let error = write_grid(field, 7, &path).unwrap_err();
+        let error = write_grid(field, 7, &path, None).unwrap_err();
         assert!(matches!(error.downcast_ref::<Failure>(), Some(Failure::Numerical(_))));
         assert!(!path.exists());
     }

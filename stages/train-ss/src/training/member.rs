@@ -9,7 +9,7 @@ use scene::{Bounds, Views};
 use stage::{Context, Progress};
 
 use super::checkpoint::{Checkpoints, Curve, read_latest};
-use super::field_trainer::{FieldTrainer, average_weights, new_trainer};
+use super::field_trainer::{FieldTrainer, new_trainer};
 use super::time_left::{TimeLeft, TrainingRays};
 use crate::params::{Combine, Exposure, Resolved};
 use crate::supervision::{Supersampling, set_up_supervision};
@@ -110,7 +110,7 @@ impl<'a> Member<'a> {
             Failure::BadInput(format!("--work {}: no complete checkpoint yet", work.display()))
         })?;
         let log = curve.finish(trainer.state());
-        self.write_weights(trainer, bounds)?;
+        self.write_weights(trainer)?;
         Ok(log)
     }
 
@@ -135,7 +135,7 @@ impl<'a> Member<'a> {
             drop(training);
             return with_exposures.run(data);
         }
-        self.finish(training, data.views.bounds)
+        self.finish(training)
     }
 
     /// Returns a copy that estimates exposures, with its checkpoints in a subfolder, which also
@@ -237,7 +237,7 @@ impl<'a> Member<'a> {
     }
 
     /// Ends a training: writes the weights, and stores weights and log for a later run.
-    fn finish(&self, training: Training, bounds: Bounds) -> anyhow::Result<TrainingLog> {
+    fn finish(&self, training: Training) -> anyhow::Result<TrainingLog> {
         let Training { trainer, supervision, curve, .. } = training;
         let mut log = curve.finish(trainer.state());
         if let Some(motion) = supervision.mean_motion(|| trainer.field())? {
@@ -249,7 +249,7 @@ impl<'a> Member<'a> {
         log.exposures = supervision.exposures().to_vec();
         log.poses =
             supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
-        self.write_weights(trainer, bounds)?;
+        self.write_weights(trainer)?;
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS))
                 .context("cannot copy the field")?;
@@ -269,13 +269,11 @@ impl<'a> Member<'a> {
     }
 
     /// Writes the trained weights, averaged with the initial ones if requested.
-    fn write_weights(&self, trainer: Box<dyn FieldTrainer>, bounds: Bounds) -> anyhow::Result<()> {
-        trainer.finish(&self.output)?;
-        if let Some((init, Combine::AverageWeights)) = &self.init {
-            average_weights(self.model, bounds, init, &self.output)
-                .context("cannot average the weights")?;
+    fn write_weights(&self, trainer: Box<dyn FieldTrainer>) -> anyhow::Result<()> {
+        match &self.init {
+            Some((init, Combine::AverageWeights)) => trainer.finish(&self.output, Some(init)),
+            _ => trainer.finish(&self.output, None),
         }
-        Ok(())
     }
 }
 
