@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use fields::FieldFile;
+use radiance::PointField as _;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Value, json};
 
@@ -166,8 +167,7 @@ fn measure_field(project: &Project) -> Figures {
     let points: Vec<[f32; 3]> = (0..64usize.pow(3))
         .map(|i| [centre(i % 64), centre(i / 64 % 64), centre(i / 4096)])
         .collect();
-    let densities = field.sample_points(&points);
-    let density = densities.iter().fold(0.0, |largest: f32, point| largest.max(point.density));
+    let density = field.densities(&points).unwrap().into_iter().fold(0.0, f32::max);
     Figures { parameter, density: density.ln(), ..Figures::default() }
 }
 

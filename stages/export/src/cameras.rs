@@ -1,10 +1,10 @@
 use std::fmt::Write as _;
 
 use glam::{DMat3, DQuat, DVec3};
+use pixels::to_u8;
 use scene::{Camera, Distortion, Intrinsics};
 use serde_json::{Value, json};
 
-use crate::ply::colour_bytes;
 use crate::surfel::Surfel;
 
 /// Maximum number of points of a COLMAP model: about as many as structure from motion finds.
@@ -119,7 +119,7 @@ pub(crate) fn colmap_files(
     let step = surfels.len().div_ceil(MAX_POINTS).max(1);
     for (i, surfel) in surfels.iter().step_by(step).enumerate() {
         let [x, y, z] = world_coordinates(surfel.position, offset);
-        let [r, g, b] = colour_bytes(surfel.colour);
+        let [r, g, b] = surfel.colour.map(to_u8);
         let _ = writeln!(points, "{} {x} {y} {z} {r} {g} {b} 0", i + 1);
     }
     [("cameras.txt", lens_text), ("images.txt", images), ("points3D.txt", points)]

@@ -67,9 +67,9 @@ fn mean_colour(
         let PointState::Surface { index, .. } = view.point_state(position, truncation) else {
             continue;
         };
-        let cosine = (view.centre() - position).normalize().dot(normal).max(0.0);
+        let cosine = (view.centre - position).normalize().dot(normal).max(0.0);
         let weight = (cosine * cosine) as f32;
-        let colour = view.pixel(index).colour;
+        let colour = view.pixels[index].colour;
         sum = [0, 1, 2].map(|c| weight.mul_add(f32::from(colour[c]) / 255.0, sum[c]));
         weights += weight;
     }

@@ -40,26 +40,23 @@ pub(crate) fn write(
     }
     let length = buffer_length(mesh);
     file.write_all(b"glTF")?;
-    write_words(file, &[VERSION, (HEADER_BYTES + text.len() + length) as u32, text.len() as u32])?;
+    write_words(file, [VERSION, (HEADER_BYTES + text.len() + length) as u32, text.len() as u32])?;
     file.write_all(b"JSON")?;
     file.write_all(text.as_bytes())?;
-    write_words(file, &[length as u32])?;
+    write_words(file, [length as u32])?;
     file.write_all(b"BIN\0")?;
     for vector in mesh.positions.iter().chain(&mesh.normals).chain(&colours) {
-        crate::ply::write_floats(file, &vector.to_array())?;
+        crate::ply::write_vector(file, *vector)?;
     }
     for triangle in &mesh.triangles {
-        write_words(file, triangle)?;
+        write_words(file, *triangle)?;
     }
     Ok(())
 }
 
 /// Writes little-endian 32-bit integers.
-fn write_words(file: &mut impl Write, words: &[u32]) -> io::Result<()> {
-    for word in words {
-        file.write_all(&word.to_le_bytes())?;
-    }
-    Ok(())
+fn write_words<const N: usize>(file: &mut impl Write, words: [u32; N]) -> io::Result<()> {
+    file.write_all(words.map(u32::to_le_bytes).as_flattened())
 }
 
 /// Returns the number of bytes of all vertices and triangles.

@@ -2,16 +2,17 @@
 
 use std::io::{self, Write};
 
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec3, Vec3};
+use pixels::to_u8;
 
 use crate::coordinates::Coordinates;
 use crate::mesh::Mesh;
 use crate::surfel::Surfel;
 
-/// PLY's name of the type `f32`.
-const FLOAT: &str = "float";
-/// PLY's name of the type `u8`.
-const BYTE: &str = "uchar";
+/// Properties of a point that are floats.
+const POINT_FLOATS: &str = "x y z nx ny nz";
+/// Properties of a point that are bytes.
+const POINT_BYTES: &str = "red green blue";
 
 /// Maximum distance in pixels from a silhouette at which normals are uncertain (design note 043).
 const MAX_UNCERTAIN_MARGIN_PIXELS: u8 = 2;
@@ -43,13 +44,10 @@ pub(crate) fn write_points(
     surfels: &[Surfel],
     coordinates: &Coordinates,
 ) -> io::Result<()> {
-    let floats = ["x", "y", "z", "nx", "ny", "nz"].map(|name| (name, FLOAT));
-    let bytes = ["red", "green", "blue"].map(|name| (name, BYTE));
-    write_header(file, coordinates, surfels.len(), &[&floats[..], &bytes].concat())?;
+    write_header(file, coordinates, surfels.len(), POINT_FLOATS, POINT_BYTES)?;
+    writeln!(file, "end_header")?;
     for surfel in surfels {
-        write_floats(file, &surfel.position.as_vec3().to_array())?;
-        write_floats(file, &surfel.normal.as_vec3().to_array())?;
-        file.write_all(&colour_bytes(surfel.colour))?;
+        write_point(file, surfel.position.as_vec3(), surfel.normal.as_vec3(), surfel.colour)?;
     }
     Ok(())
 }
@@ -62,27 +60,15 @@ pub(crate) fn write_mesh(
     colours: &[[f32; 3]],
     coordinates: &Coordinates,
 ) -> io::Result<()> {
-    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
-    writeln!(file, "comment {coordinates}")?;
-    writeln!(file, "element vertex {}", mesh.positions.len())?;
-    for name in ["x", "y", "z", "nx", "ny", "nz"] {
-        writeln!(file, "property {FLOAT} {name}")?;
-    }
-    for name in ["red", "green", "blue"] {
-        writeln!(file, "property {BYTE} {name}")?;
-    }
+    write_header(file, coordinates, mesh.positions.len(), POINT_FLOATS, POINT_BYTES)?;
     writeln!(file, "element face {}", mesh.triangles.len())?;
-    writeln!(file, "property list {BYTE} int vertex_indices\nend_header")?;
-    for (i, colour) in colours.iter().enumerate() {
-        write_floats(file, &mesh.positions[i].to_array())?;
-        write_floats(file, &mesh.normals[i].to_array())?;
-        file.write_all(&colour_bytes(*colour))?;
+    writeln!(file, "property list uchar int vertex_indices\nend_header")?;
+    for (i, &colour) in colours.iter().enumerate() {
+        write_point(file, mesh.positions[i], mesh.normals[i], colour)?;
     }
     for triangle in &mesh.triangles {
         file.write_all(&[3])?;
-        for vertex in triangle {
-            file.write_all(&vertex.to_le_bytes())?;
-        }
+        file.write_all(triangle.map(u32::to_le_bytes).as_flattened())?;
     }
     Ok(())
 }
@@ -97,10 +83,10 @@ pub(crate) fn write_splats(
 ) -> io::Result<()> {
     let names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 \
         rot_2 rot_3";
-    let properties: Vec<_> = names.split_whitespace().map(|name| (name, FLOAT)).collect();
-    write_header(file, coordinates, surfels.len(), &properties)?;
+    write_header(file, coordinates, surfels.len(), names, "")?;
+    writeln!(file, "end_header")?;
     for surfel in surfels {
-        write_floats(file, &splat_properties(surfel))?;
+        file.write_all(splat_properties(surfel).map(f32::to_le_bytes).as_flattened())?;
     }
     Ok(())
 }
@@ -120,31 +106,38 @@ fn splat_properties(surfel: &Surfel) -> [f32; 17] {
     [x, y, z, nx, ny, nz, r, g, b, logit, along, along, across, q.w, q.x, q.y, q.z]
 }
 
-/// Writes the header of a binary little-endian PLY file with one list of elements.
+/// Writes the header of a binary little-endian PLY file up to the properties of its `count`
+/// vertices: names of floats, then of bytes.
 fn write_header(
     file: &mut impl Write,
     coordinates: &Coordinates,
     count: usize,
-    properties: &[(&str, &str)],
+    floats: &str,
+    bytes: &str,
 ) -> io::Result<()> {
     writeln!(file, "ply\nformat binary_little_endian 1.0")?;
-    writeln!(file, "comment {coordinates}")?;
-    writeln!(file, "element vertex {count}")?;
-    for (name, property_type) in properties {
-        writeln!(file, "property {property_type} {name}")?;
-    }
-    writeln!(file, "end_header")
-}
-
-/// Writes little-endian floats.
-pub(crate) fn write_floats(file: &mut impl Write, values: &[f32]) -> io::Result<()> {
-    for value in values {
-        file.write_all(&value.to_le_bytes())?;
+    writeln!(file, "comment {coordinates}\nelement vertex {count}")?;
+    for (kind, names) in [("float", floats), ("uchar", bytes)] {
+        for name in names.split_whitespace() {
+            writeln!(file, "property {kind} {name}")?;
+        }
     }
     Ok(())
 }
 
-/// Converts a colour to 8 bits.
-pub(crate) fn colour_bytes(colour: [f32; 3]) -> [u8; 3] {
-    colour.map(|v| (255.0 * v.clamp(0.0, 1.0) + 0.5) as u8)
+/// Writes a point with its normal and colour.
+fn write_point(
+    file: &mut impl Write,
+    position: Vec3,
+    normal: Vec3,
+    colour: [f32; 3],
+) -> io::Result<()> {
+    write_vector(file, position)?;
+    write_vector(file, normal)?;
+    file.write_all(&colour.map(to_u8))
+}
+
+/// Writes little-endian floats.
+pub(crate) fn write_vector(file: &mut impl Write, vector: Vec3) -> io::Result<()> {
+    file.write_all(vector.to_array().map(f32::to_le_bytes).as_flattened())
 }

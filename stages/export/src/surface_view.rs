@@ -2,6 +2,7 @@ use std::ops::Range;
 
 use fields::{pixel_rays, rendering_failure};
 use glam::{DMat3, DVec3, Mat3, Vec3};
+use pixels::to_u8;
 use radiance::{Pixel, RayField};
 use scene::{Background, Camera, Intrinsics};
 use stage::Progress;
@@ -21,14 +22,14 @@ const MAX_BASELINE_PIXELS: usize = 4;
 pub(crate) struct SurfaceView {
     intrinsics: Intrinsics,
     /// Camera axes (x right, y up, looking along -z) as columns, in the world.
-    axes: DMat3,
+    pub(crate) axes: DMat3,
     /// Centre, in the frame of the exported files.
-    centre: DVec3,
+    pub(crate) centre: DVec3,
     /// Rotation from world to camera axes in single precision, for [`SurfaceView::point_state`].
     to_camera: Mat3,
     /// Focal lengths and principal point in single precision: fx, fy, cx, cy.
     lens: [f32; 4],
-    pixels: Vec<SurfacePixel>,
+    pub(crate) pixels: Vec<SurfacePixel>,
 }
 
 /// Pixel of a [`SurfaceView`].
@@ -212,11 +213,6 @@ impl SurfaceView {
         self.pixels.iter().enumerate().filter(|(_, pixel)| pixel.normal != Vec3::ZERO)
     }
 
-    /// Returns a pixel.
-    pub(crate) fn pixel(&self, index: usize) -> &SurfacePixel {
-        &self.pixels[index]
-    }
-
     /// Returns a pixel's surface point in the frame of the exported files.
     pub(crate) fn world_point(&self, index: usize) -> DVec3 {
         self.centre + self.axes * self.point(index).as_dvec3()
@@ -245,16 +241,6 @@ impl SurfaceView {
     /// behind it.
     pub(crate) fn remove_surface(&mut self, index: usize) {
         self.pixels[index].normal = Vec3::ZERO;
-    }
-
-    /// Returns the camera's centre in the frame of the exported files.
-    pub(crate) fn centre(&self) -> DVec3 {
-        self.centre
-    }
-
-    /// Returns the camera's right axis in the world, of unit length.
-    pub(crate) fn right(&self) -> DVec3 {
-        self.axes.x_axis
     }
 
     /// Returns the width of a pixel at its surface's depth, in scene units.
@@ -302,12 +288,11 @@ const MAX_DEPTH_RATIO: f32 = 4.0;
 /// Converts a rendered pixel; `z_per_distance` is z-depth per distance along the pixel's ray.
 fn surface_pixel(pixel: &Pixel, z_per_distance: f32) -> SurfacePixel {
     let has_surface = pixel.opacity >= MIN_OPACITY;
-    let level = |v: f32| (255.0 * v.clamp(0.0, 1.0) + 0.5) as u8;
     SurfacePixel {
         depth: if has_surface { pixel.median_depth * z_per_distance } else { 0.0 },
         normal: Vec3::ZERO,
-        colour: pixel.premultiplied.map(|v| level(v / pixel.opacity.max(MIN_OPACITY))),
-        opacity: level(pixel.opacity),
+        colour: pixel.premultiplied.map(|v| to_u8(v / pixel.opacity.max(MIN_OPACITY))),
+        opacity: to_u8(pixel.opacity),
         is_edge: false,
         margin: 0,
     }

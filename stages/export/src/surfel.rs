@@ -64,7 +64,7 @@ fn finest_edge(views: &[SurfaceView], bounds: &Bounds) -> f64 {
 /// Returns the scale from scene units to the unit cube at a pixel's point.
 fn cube_scale(view: &SurfaceView, bounds: &Bounds, index: usize) -> f64 {
     let (point, width) = (view.world_point(index), view.pixel_width(index));
-    (bounds.to_cube(point + width * view.right()) - bounds.to_cube(point)).length() / width
+    (bounds.to_cube(point + width * view.axes.x_axis) - bounds.to_cube(point)).length() / width
 }
 
 /// Collects all surface pixels inside the cube, sorted.
@@ -95,13 +95,13 @@ fn mean_surfel(
     group: &[Sample],
 ) -> Option<Surfel> {
     // Silhouettes are accurate only to a pixel, so a cell with silhouette pixels alone is dropped.
-    let margins = group.iter().map(|&(_, view, i)| views[view as usize].pixel(i as usize).margin);
+    let margins = group.iter().map(|&(_, view, i)| views[view as usize].pixels[i as usize].margin);
     let margin = margins.max().filter(|margin| *margin > 0)?;
     let (mut position, mut normal, mut colour) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
     let (mut opacity, mut width_sum, mut cell_width_sum, mut weights) = (0.0, 0.0, 0.0, 0.0);
     for &(_, view_index, index) in group {
         let (view, index) = (&views[view_index as usize], index as usize);
-        let pixel = view.pixel(index);
+        let pixel = &view.pixels[index];
         let width = view.pixel_width(index);
         let weight = f64::from(view.cosine(index)).max(0.05).powi(2) / (width * width);
         position += weight * view.world_point(index);

@@ -18,7 +18,9 @@ use scene::{Bounds, Camera, Views};
 use serde::{Deserialize, Serialize};
 #[cfg(feature = "torch")]
 use train_ss::MlpParams;
-use train_ss::{FieldParams, GridParams, Params, ResolvedField, SceneFacts};
+use train_ss::{
+    FieldParams, GridParams, Params, Resolved, ResolvedField, SceneFacts, Supersampling,
+};
 
 #[derive(Serialize, Deserialize)]
 struct Row {
@@ -87,10 +89,8 @@ fn choose_family(name: &str) -> anyhow::Result<()> {
 
 /// Reads the rows that an earlier run wrote.
 fn read_rows(file: &Path) -> anyhow::Result<Rows> {
-    let bytes = std::fs::read(file).with_context(|| format!("AGAINST = {}", file.display()))?;
-    Ok(Rows(
-        serde_json::from_slice(&bytes).with_context(|| format!("AGAINST = {}", file.display()))?,
-    ))
+    let read = || anyhow::Ok(Rows(serde_json::from_slice(&std::fs::read(file)?)?));
+    read().with_context(|| format!("AGAINST = {}", file.display()))
 }
 
 /// Prints this run's values over those of an earlier one.
@@ -99,13 +99,8 @@ fn compare(rows: &Rows, earlier: &Rows) {
     for row in &earlier.0 {
         let now = rows.value(&row.name);
         if now.is_finite() {
-            println!(
-                "{:<52} {:>14.1} {now:>14.1} {:>7.2} {}",
-                row.name,
-                row.value,
-                now / row.value,
-                row.unit
-            );
+            let Row { name, value, unit } = row;
+            println!("{name:<52} {value:>14.1} {now:>14.1} {:>7.2} {unit}", now / value);
         }
     }
 }
@@ -166,6 +161,7 @@ fn one_core<T: Send>(run: impl FnOnce() -> T + Send) -> T {
 /// Measures f32 matrix products, one on each core in parallel.
 fn sgemm() -> f64 {
     const N: usize = 768;
+    const ROW: isize = N as isize;
     let threads = rayon::current_num_threads();
     let mut work: Vec<[Vec<f32>; 3]> =
         (0..threads).map(|_| [0.5, 0.25, 0.0].map(|v| vec![v; N * N])).collect();
@@ -174,22 +170,8 @@ fn sgemm() -> f64 {
             for [a, b, c] in &mut work {
                 // SAFETY: three matrices of N·N floats, row by row.
                 scope.spawn(|_| unsafe {
-                    matrixmultiply::sgemm(
-                        N,
-                        N,
-                        N,
-                        1.0,
-                        a.as_ptr(),
-                        N as isize,
-                        1,
-                        b.as_ptr(),
-                        N as isize,
-                        1,
-                        0.0,
-                        c.as_mut_ptr(),
-                        N as isize,
-                        1,
-                    );
+                    let (a, b, c) = (a.as_ptr(), b.as_ptr(), c.as_mut_ptr());
+                    matrixmultiply::sgemm(N, N, N, 1.0, a, ROW, 1, b, ROW, 1, 0.0, c, ROW, 1);
                 });
             }
         });
@@ -231,27 +213,17 @@ fn rays(count: usize) -> Vec<Ray> {
 /// Measures one core in a field of low density, where almost every sample gets a colour.
 fn passes(rows: &mut Rows) {
     let bounds = Bounds::cube(1.0, 1.0, 9.0);
-    let default = Architecture::default();
+    let narrow = Architecture {
+        n_levels: 8,
+        log2_hashmap_size: 17,
+        hidden_dim: 32,
+        ..Architecture::default()
+    };
     let variants = [
-        ("", Architecture { n_levels: 8, log2_hashmap_size: 17, hidden_dim: 32, ..default }),
-        (
-            "_64_wide",
-            Architecture { n_levels: 8, log2_hashmap_size: 17, hidden_dim: 64, ..default },
-        ),
-        (
-            "_2_19_entries",
-            Architecture { n_levels: 8, log2_hashmap_size: 19, hidden_dim: 32, ..default },
-        ),
-        (
-            "_256_steps",
-            Architecture {
-                n_levels: 8,
-                log2_hashmap_size: 17,
-                hidden_dim: 32,
-                march_steps: 256,
-                ..default
-            },
-        ),
+        ("", narrow),
+        ("_64_wide", Architecture { hidden_dim: 64, ..narrow }),
+        ("_2_19_entries", Architecture { log2_hashmap_size: 19, ..narrow }),
+        ("_256_steps", Architecture { march_steps: 256, ..narrow }),
     ];
     for (name, architecture) in variants {
         let field = Field::new(architecture, bounds, 1);
@@ -287,6 +259,10 @@ fn passes(rows: &mut Rows) {
     }
 }
 
+fn supervision(input: &GivenInput, params: &Resolved) -> anyhow::Result<Supersampling> {
+    train_ss::set_up_supervision(input, params, None, &std::env::temp_dir(), false, &|_| ())
+}
+
 /// Scene to train on.
 struct Scene {
     input: GivenInput,
@@ -306,14 +282,7 @@ impl Scene {
     fn train(&self, params: &Params) -> anyhow::Result<Trained> {
         let Self { input, views } = self;
         let params = params.resolve(&SceneFacts::of(views, true));
-        let mut supervision = train_ss::set_up_supervision(
-            input,
-            &params,
-            None,
-            &std::env::temp_dir(),
-            false,
-            &|_| (),
-        )?;
+        let mut supervision = supervision(input, &params)?;
         let ResolvedField::Grid { architecture, regularisers, given } = &params.field else {
             anyhow::bail!("a grid is measured here");
         };
@@ -324,7 +293,7 @@ impl Scene {
         while let Some(report) = trainer.step(&mut supervision)? {
             samples += report.samples;
         }
-        let done = trainer.rays_done() as f64;
+        let done = trainer.state().rays as f64;
         Ok(Trained {
             rays_per_second: done / start.elapsed().as_secs_f64(),
             samples_per_ray: samples as f64 / done,
@@ -472,11 +441,9 @@ fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()>
     let ResolvedField::Mlp { architecture, density_noise_std } = &params.field else {
         anyhow::bail!("MLPs are measured here");
     };
-    nets::deterministic();
-    let mut supervision =
-        train_ss::set_up_supervision(input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
-    let field =
-        torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
+    let mut supervision = supervision(input, &params)?;
+    let device = fields::torch_device("cpu")?;
+    let field = torch_field::Mlp::new(*architecture, views.bounds, params.seed, device)?;
     let weights = field.parameter_count() / 2;
     let mut trainer = torch_field::MlpTrainer::new(field, params.mlp_training(*density_noise_std))?;
     trainer.step(&mut supervision)?;

@@ -1,12 +1,13 @@
 //! Visual hull of photographs with alpha: cells that some photograph shows empty.
 
-use anyhow::Context as _;
-use artifact::{FailureExt as _, GivenInput};
+use artifact::GivenInput;
 use glam::DVec3;
 use pixels::Mask;
 use radiance::spec::OCCUPANCY_CELLS;
 use rayon::prelude::*;
 use scene::{Background, Bounds, Camera, Photograph, Space, Views};
+
+use crate::photographs::read_photograph;
 
 /// Distance in pixels from a transparent region within which cells are kept: kernels with negative
 /// lobes may cancel the alpha of thin parts at an object's border (design note 049).
@@ -24,12 +25,7 @@ pub(crate) fn cells_within(input: &GivenInput, views: &Views) -> anyhow::Result<
     let mut cells = vec![true; OCCUPANCY_CELLS.pow(3)];
     let mut has_alpha = false;
     for view in &views.views {
-        let folder = input.folder().display();
-        let photograph = view.read_photograph(input).bad_input(&folder)?;
-        let photograph = photograph
-            .with_context(|| format!("view {} has no image", view.camera.name))
-            .bad_input(&folder)?;
-        if let Some(silhouette) = Silhouette::new(&photograph) {
+        if let Some(silhouette) = Silhouette::new(&read_photograph(input, view)?) {
             has_alpha = true;
             silhouette.carve(&view.camera, &views.bounds, &mut cells);
         }

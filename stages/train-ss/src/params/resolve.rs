@@ -4,8 +4,8 @@ use torch_field::MlpArchitecture;
 use workload::RayBudget;
 
 use super::{
-    Combine, Exposure, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
-    SceneFacts, Supervision,
+    Combine, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField, SceneFacts,
+    Supervision,
 };
 use crate::supersample::whole_supersample;
 
@@ -27,6 +27,7 @@ const DISTORTION_IN_NDC: f64 = 0.004;
 const DISTORTION_IN_CONTRACTION: f64 = 0.002;
 /// Weight of the floater loss with a background of one colour (design note 013).
 const FLOATER_LOSS: f64 = 0.001;
+
 impl Params {
     /// Sets every default for a scene. A fine-tuning ignores `supersample_warmup` and
     /// `precrop_steps`.
@@ -53,14 +54,13 @@ impl Params {
             && scene.background != Background::Alpha
             && !scene.is_fine_tuning
             && !self.pose_refinement;
-        let exposure = if can_measure { Exposure::ByScene } else { Exposure::Off };
         let combine = if scene.is_ndc() { Combine::AverageWeights } else { Combine::Ensemble };
         Resolved {
-            field: self.field.resolve(scene),
+            field: settings.field,
             supersample: self.supersample,
             supersample_warmup: settings.supersample_warmup,
             supervision: self.supervision.unwrap_or(supervision),
-            exposure: self.exposure.map_or(exposure, Exposure::from),
+            exposure: self.exposure.or((!can_measure).then_some(false)),
             pose_refinement: self.pose_refinement,
             silhouettes: self.silhouettes && is_grid,
             in_epochs: !is_grid,
@@ -80,6 +80,7 @@ impl Params {
 
 /// Settings of a training that depend on the kind of field: given values or defaults.
 struct FieldSettings {
+    field: ResolvedField,
     rays: u64,
     max_rays_per_step: u32,
     learning_rate: f64,
@@ -99,6 +100,11 @@ impl GridParams {
         };
         let is_opaque = scene.background == Background::Opaque;
         FieldSettings {
+            field: ResolvedField::Grid {
+                architecture: self.architecture(scene),
+                regularisers: self.regularisers(scene),
+                given: self.clone(),
+            },
             rays: budget.total(scene.lr_pixels, is_opaque, scene.is_fine_tuning),
             // Design note 007.
             max_rays_per_step: 8_192,
@@ -144,9 +150,21 @@ impl MlpParams {
         scene: &SceneFacts,
         rays_per_epoch: u64,
     ) -> FieldSettings {
-        let (epochs, precrop_steps) =
-            if scene.is_ndc() { (EPOCHS_IN_NDC, 0) } else { (EPOCHS, PRECROP_STEPS) };
+        let (epochs, precrop_steps, density_noise_std) = if scene.is_ndc() {
+            (EPOCHS_IN_NDC, 0, DENSITY_NOISE_STD_IN_NDC)
+        } else {
+            (EPOCHS, PRECROP_STEPS, 0.0)
+        };
+        let architecture = MlpArchitecture {
+            scaled_positions: true,
+            layers: self.layers,
+            hidden_dim: self.hidden_dim,
+            coarse_samples: self.coarse_samples,
+            fine_samples: self.fine_samples,
+            ..MlpArchitecture::default()
+        };
         FieldSettings {
+            field: ResolvedField::Mlp { architecture, density_noise_std },
             rays: rays.unwrap_or(epochs * rays_per_epoch),
             // As in the paper's code.
             max_rays_per_step: 2_048,
@@ -154,33 +172,6 @@ impl MlpParams {
             pixel_importance: 1.0,
             supersample_warmup: 0.0,
             precrop_steps: self.precrop_steps.unwrap_or(precrop_steps),
-        }
-    }
-
-    fn architecture(&self) -> MlpArchitecture {
-        MlpArchitecture {
-            scaled_positions: true,
-            layers: self.layers,
-            hidden_dim: self.hidden_dim,
-            coarse_samples: self.coarse_samples,
-            fine_samples: self.fine_samples,
-            ..MlpArchitecture::default()
-        }
-    }
-}
-
-impl FieldParams {
-    fn resolve(&self, scene: &SceneFacts) -> ResolvedField {
-        match self {
-            Self::Grid(grid) => ResolvedField::Grid {
-                architecture: grid.architecture(scene),
-                regularisers: grid.regularisers(scene),
-                given: grid.clone(),
-            },
-            Self::Mlp(mlp) => ResolvedField::Mlp {
-                architecture: mlp.architecture(),
-                density_noise_std: if scene.is_ndc() { DENSITY_NOISE_STD_IN_NDC } else { 0.0 },
-            },
         }
     }
 }

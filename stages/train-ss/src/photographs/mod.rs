@@ -7,7 +7,7 @@ mod references;
 
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput};
-use scene::{Background, View, Views};
+use scene::{Background, Photograph, View, Views};
 
 pub(crate) use packed::PackedPhotograph;
 pub(crate) use pixel_memory::{Bytes, PixelMemory};
@@ -39,7 +39,7 @@ impl Photographs {
         let images = views
             .views
             .iter()
-            .map(|view| read_photograph(input, view, memory))
+            .map(|view| pack_photograph(input, view, memory))
             .collect::<anyhow::Result<_>>()?;
         Ok(Self { views, images })
     }
@@ -78,21 +78,28 @@ impl Photographs {
     }
 }
 
-fn read_photograph(
+/// Reads the photograph of a view, which must have one.
+pub(crate) fn read_photograph(input: &GivenInput, view: &View) -> Result<Photograph, Failure> {
+    let folder = input.folder().display();
+    let photograph = view.read_photograph(input).bad_input(&folder)?;
+    photograph.with_context(|| format!("view {} has no image", view.camera.name)).bad_input(&folder)
+}
+
+/// Reads and packs the photograph of a view, which must have the camera's size.
+fn pack_photograph(
     input: &GivenInput,
     view: &View,
     memory: &mut PixelMemory,
 ) -> anyhow::Result<PackedPhotograph> {
     let (name, k) = (&view.camera.name, view.camera.intrinsics);
-    let folder = input.folder().display();
-    let photograph = view.read_photograph(input).bad_input(&folder)?;
-    let photograph =
-        photograph.with_context(|| format!("view {name} has no image")).bad_input(&folder)?;
+    let photograph = read_photograph(input, view)?;
     let (width, height) = (photograph.image.width, photograph.image.height);
     if (width, height) != (k.width as usize, k.height as usize) {
         let message = format!(
-            "{folder}: view {name}: the image has {width}×{height} pixels, its camera {}×{}",
-            k.width, k.height
+            "{}: view {name}: the image has {width}×{height} pixels, its camera {}×{}",
+            input.folder().display(),
+            k.width,
+            k.height
         );
         return Err(Failure::BadInput(message).into());
     }

@@ -1,6 +1,8 @@
 use std::fmt;
 use std::ops::Range;
 
+use serde::{Deserialize, Serialize};
+
 /// Factor by which a view's sums decay with every drawn pixel; chosen by hand.
 const DECAY: f64 = 0.998;
 /// Weight of the prior that gains are 1, in white pixels; chosen by hand.
@@ -22,7 +24,7 @@ const MAX_MEASURED_PROGRESS: f64 = 0.25;
 
 /// Sums of photographed · rendered and of rendered², for every view and channel, from which gains
 /// follow by least squares.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct GainSums(Vec<[[f64; 2]; 3]>);
 
 impl GainSums {
@@ -49,17 +51,6 @@ impl GainSums {
         let mean = logarithms.iter().sum::<f64>() / logarithms.len().max(1) as f64;
         logarithms.into_iter().map(|logarithm| logarithm - mean).collect()
     }
-
-    fn to_bytes(&self) -> Vec<u8> {
-        self.0.as_flattened().as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect()
-    }
-
-    fn restore(&mut self, bytes: &[u8]) {
-        let sums = self.0.as_flattened_mut().as_flattened_mut();
-        for (sum, number) in sums.iter_mut().zip(bytes.as_chunks::<8>().0) {
-            *sum = f64::from_le_bytes(*number);
-        }
-    }
 }
 
 /// Per-channel gain of each photograph relative to the field's render, by least squares over the
@@ -68,9 +59,11 @@ impl GainSums {
 ///
 /// Gains apply to display-encoded colours: exposure scales linear light, and the sRGB encoding is
 /// almost a power function.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Exposures {
     sums: GainSums,
+    /// Gains, which follow from the sums.
+    #[serde(skip)]
     gains: Vec<[f32; 3]>,
 }
 
@@ -102,19 +95,19 @@ impl Exposures {
         }
     }
 
-    /// Serialises the sums, from which the gains follow.
-    pub(crate) fn to_bytes(&self) -> Vec<u8> {
-        self.sums.to_bytes()
+    /// Returns the number of views.
+    pub(crate) fn views(&self) -> usize {
+        self.sums.0.len()
     }
 
-    /// Restores the result of [`Exposures::to_bytes`].
-    pub(crate) fn restore(&mut self, bytes: &[u8]) {
-        self.sums.restore(bytes);
+    /// Restores the sums of a checkpoint.
+    pub(crate) fn restore(&mut self, saved: Self) {
+        self.sums = saved.sums;
     }
 }
 
 /// Measurement of the photographs' gains in the first steps of a training that applies none.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ExposureMeasurement {
     measurements: Vec<(Range<u64>, f64)>,
     /// Number of steps that have started.
@@ -167,18 +160,9 @@ impl ExposureMeasurement {
         Some(ExposureDifference { steps: self.steps, spread: mean_square.sqrt(), limit })
     }
 
-    /// Serialises steps, error and sums.
-    pub(crate) fn to_bytes(&self) -> Vec<u8> {
-        [&self.steps.to_le_bytes()[..], &self.error.to_le_bytes(), &self.sums.to_bytes()].concat()
-    }
-
-    /// Restores the result of [`ExposureMeasurement::to_bytes`].
-    pub(crate) fn restore(&mut self, bytes: &[u8]) {
-        let Some((steps, sums)) = bytes.split_first_chunk::<8>() else { return };
-        let Some((error, sums)) = sums.split_first_chunk::<8>() else { return };
-        self.steps = u64::from_le_bytes(*steps);
-        self.error = f64::from_le_bytes(*error);
-        self.sums.restore(sums);
+    /// Returns the number of views.
+    pub(crate) fn views(&self) -> usize {
+        self.sums.0.len()
     }
 }
 
@@ -226,6 +210,10 @@ impl fmt::Display for ExposureDifference {
 mod tests {
     use super::*;
 
+    fn json_round_trip<T: Serialize + serde::de::DeserializeOwned>(value: &T) -> T {
+        serde_json::from_slice(&serde_json::to_vec(value).unwrap()).unwrap()
+    }
+
     /// Gains are estimated up to a common factor, and restored from a checkpoint.
     #[test]
     fn gains_are_estimated() {
@@ -248,8 +236,8 @@ mod tests {
             );
         }
         let mut restored = Exposures::new(3);
-        assert_eq!(exposures.to_bytes().len(), restored.to_bytes().len());
-        restored.restore(&exposures.to_bytes());
+        assert_eq!(exposures.views(), restored.views());
+        restored.restore(json_round_trip(&exposures));
         restored.update_gains(0.5);
         assert_eq!(restored.gains(), exposures.gains());
     }
@@ -309,9 +297,8 @@ mod tests {
             measurement.add_pixel(0, [0.5; 3], [0.4; 3]);
             measurement.add_pixel(1, [0.4; 3], [0.5; 3]);
             if step == 150 {
-                let mut restored = ExposureMeasurement::new(2, true);
-                restored.restore(&measurement.to_bytes());
-                assert_eq!(restored.to_bytes(), measurement.to_bytes());
+                let restored = json_round_trip(&measurement);
+                assert_eq!(restored, measurement);
                 measurement = restored;
             }
             assert_eq!(measurement.difference(0.1, 2).is_some(), [35, 191].contains(&step));

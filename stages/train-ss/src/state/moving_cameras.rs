@@ -1,6 +1,7 @@
 use poses::{CameraMotion, MeanMotion, Options, Pyramid, refine, remove_common_motion};
 use radiance::{RayField, RenderError};
 use scene::Camera;
+use serde::{Deserialize, Serialize};
 
 use crate::photographs::{PackedPhotograph, Photographs};
 
@@ -21,10 +22,12 @@ const MAX_RENDERS_PER_ROUND: u32 = 3;
 const FIRST_HALVINGS: u32 = 3;
 
 /// Cameras that move during training so that the field's renders fit their photographs.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct MovingCameras {
+    #[serde(skip)]
     given: Vec<Camera>,
     current: Vec<Camera>,
+    #[serde(skip)]
     photographs: Vec<Pyramid>,
     /// Number of rounds done.
     rounds: u32,
@@ -94,25 +97,9 @@ impl MovingCameras {
         Ok(MeanMotion::of_cameras(moves.into_iter()))
     }
 
-    /// Serialises the number of rounds and the current poses.
-    pub(crate) fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = self.rounds.to_le_bytes().to_vec();
-        for camera in &self.current {
-            let numbers = camera.camera_to_world.as_flattened();
-            bytes.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
-        }
-        bytes
-    }
-
-    /// Restores the result of [`MovingCameras::to_bytes`].
-    pub(crate) fn restore(&mut self, bytes: &[u8]) {
-        let Some((rounds, poses)) = bytes.split_first_chunk::<4>() else { return };
-        self.rounds = u32::from_le_bytes(*rounds);
-        let numbers =
-            self.current.iter_mut().flat_map(|camera| camera.camera_to_world.as_flattened_mut());
-        for (number, bytes) in numbers.zip(poses.as_chunks::<8>().0) {
-            *number = f64::from_le_bytes(*bytes);
-        }
+    /// Restores the rounds and cameras of a checkpoint.
+    pub(crate) fn restore(&mut self, saved: Self) {
+        (self.rounds, self.current) = (saved.rounds, saved.current);
     }
 }
 
@@ -163,9 +150,8 @@ mod tests {
         let moved = moving.mean_motion(&field, 2, 1.0).unwrap();
         assert!((moved.distance - 0.125).abs() < 0.05 && moved.pixels.is_finite(), "{moved:?}");
         let mut restored = new_cameras();
-        let bytes = moving.to_bytes();
-        assert_eq!(bytes.len(), restored.to_bytes().len());
-        restored.restore(&bytes);
+        let saved = serde_json::to_string(&moving).unwrap();
+        restored.restore(serde_json::from_str(&saved).unwrap());
         assert_eq!((restored.rounds, &restored.current), (moving.rounds, &moving.current));
     }
 }

@@ -8,7 +8,6 @@ use scene::{Camera, Space};
 use super::options::SupersamplingOptions;
 use super::pixel_sampler::{Importance, PixelSampler, ViewPixels, detailed_pixels};
 use super::{Supersampling, TrainingView};
-use crate::params::Exposure;
 use crate::photographs::{PackedPhotograph, Photographs, PixelMemory, PixelSet};
 use crate::state::{
     ExposureMeasurement, Exposures, HrCache, KernelOperator, MovingCameras, SupervisionState,
@@ -42,35 +41,32 @@ impl Supersampling {
         for (view, reference) in references.into_iter().flat_map(Photographs::into_pairs) {
             assembly.add_reference(&view.camera, reference)?;
         }
-        let Assembly {
-            supersample,
-            views,
-            view_pixels,
-            index_count,
-            unmasked_count,
-            detailed,
-            cache,
-            memory,
-            ..
-        } = assembly;
-        let counts = (index_count, unmasked_count);
-        let importance = Importance::new(params.pixel_importance, counts, detailed);
-        let order = (params.in_epochs, params.precrop_bundles());
+        let view_count = assembly.views.len();
+        let counts = (assembly.index_count, assembly.unmasked_count);
         Ok(Self {
-            sampler: PixelSampler::new(view_pixels, index_count, importance, order, params.seed),
+            sampler: PixelSampler {
+                views: assembly.view_pixels,
+                index_count: assembly.index_count,
+                importance: Importance::new(params.pixel_importance, counts, assembly.detailed),
+                in_epochs: params.in_epochs,
+                precrop_bundles: params.precrop_bundles(),
+                seed: params.seed,
+            },
             state: SupervisionState {
-                cache,
-                exposures: (params.exposure == Exposure::On).then(|| Exposures::new(views.len())),
-                measurement: (params.exposure == Exposure::ByScene)
-                    .then(|| ExposureMeasurement::new(views.len(), is_contraction)),
+                cache: assembly.cache,
+                exposures: (params.exposure == Some(true)).then(|| Exposures::new(view_count)),
+                measurement: params
+                    .exposure
+                    .is_none()
+                    .then(|| ExposureMeasurement::new(view_count, is_contraction)),
                 cameras,
             },
-            views,
+            views: assembly.views,
             background,
-            schedule: SupersampleSchedule::new(supersample, params.supersample_warmup),
+            schedule: SupersampleSchedule::new(assembly.supersample, params.supersample_warmup),
             supervision: params.supervision,
             seed: params.seed,
-            memory,
+            memory: assembly.memory,
         })
     }
 }

@@ -109,16 +109,15 @@ impl Supersampling {
         [block_start(pixel.x, columns, hr.width), block_start(pixel.y, rows, hr.height)]
     }
 
-    /// Restores the state that [`SupervisionState::write`] wrote.
-    pub(crate) fn restore(&mut self, from: &mut impl io::Read) -> io::Result<()> {
-        self.state.restore(from)?;
+    /// Restores the state of a checkpoint, see [`SupervisionState::restore`].
+    pub(crate) fn restore(
+        &mut self,
+        saved: SupervisionState,
+        from: &mut impl io::Read,
+    ) -> io::Result<()> {
+        self.state.restore(saved, from)?;
         self.update_rays();
         Ok(())
-    }
-
-    /// Returns the first I/O error of the pixel file, if any.
-    pub(crate) fn first_error(&self) -> Option<&io::Error> {
-        self.memory.first_error()
     }
 
     /// Moves cameras towards the poses at which the field's renders fit the photographs, if pose
@@ -663,7 +662,7 @@ mod tests {
                 Some(photograph_of_size(&camera, "a", width, height)),
                 &options(kind, 2.0),
             );
-            assert_eq!(joined.sampler.index_count(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
+            assert_eq!(joined.sampler.index_count, 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
             let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
             let mut has_ray = [false; 72];
             for bundle in 0..800 {
@@ -724,7 +723,7 @@ mod tests {
             Some(photograph_of_size(&camera, "a", 20, 16)),
             &options(Supervision::Kernel, 2.0),
         );
-        assert_eq!(larger.sampler.index_count(), 20 + 80);
+        assert_eq!(larger.sampler.index_count, 20 + 80);
         let mut masked = truth;
         masked.data[..3].fill(f32::NAN);
         let means = block_means(&masked, [2, 2]);
@@ -754,7 +753,7 @@ mod tests {
             assert!(joined.loss_and_gradient(bundle, &colours, &mut gradients).is_finite());
             record_colours(&mut joined, bundle, &colours);
         }
-        assert_eq!(joined.state.byte_length(), 3 * (2 * 2 + 5 * 3));
+        assert_eq!(joined.state.cache.unwrap().byte_length(), 3 * (2 * 2 + 5 * 3));
     }
 
     #[test]

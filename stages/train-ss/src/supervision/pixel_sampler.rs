@@ -7,16 +7,16 @@ use crate::photographs::PixelSet;
 /// Sampler of the pixel that a bundle trains on. Pixels are indexed over all views in order; a
 /// pixel of an HR reference has several indices, so that it is drawn more often.
 pub(crate) struct PixelSampler {
-    views: Vec<ViewPixels>,
+    pub(crate) views: Vec<ViewPixels>,
     /// Total number of pixel indices.
-    index_count: u64,
-    importance: Importance,
+    pub(crate) index_count: u64,
+    pub(crate) importance: Importance,
     /// True if each pixel index is drawn once per epoch.
     pub(crate) in_epochs: bool,
     /// Number of bundles at the start that come from the middle half of each image's width and
     /// height.
     pub(crate) precrop_bundles: u64,
-    seed: u64,
+    pub(crate) seed: u64,
 }
 
 /// Size and first pixel index of a view.
@@ -39,17 +39,6 @@ const EPOCH_STREAM: u64 = 110;
 const MAX_DRAWS: usize = 64;
 
 impl PixelSampler {
-    /// Creates a sampler of views with `index_count` pixel indices in total.
-    pub(crate) fn new(
-        views: Vec<ViewPixels>,
-        index_count: u64,
-        importance: Importance,
-        (in_epochs, precrop_bundles): (bool, u64),
-        seed: u64,
-    ) -> Self {
-        Self { views, index_count, importance, in_epochs, precrop_bundles, seed }
-    }
-
     /// Returns the view and pixel that a bundle trains on. `is_valid` returns whether a view's
     /// pixel is unmasked; epochs ignore `is_valid`, since they contain all pixels.
     pub(crate) fn draw(
@@ -101,12 +90,6 @@ impl PixelSampler {
         } else {
             self.importance.weight(self.views[view].start + pixel as u64)
         }
-    }
-
-    /// Returns the total number of pixel indices.
-    #[cfg(test)]
-    pub(crate) fn index_count(&self) -> u64 {
-        self.index_count
     }
 }
 
@@ -268,13 +251,18 @@ mod tests {
         }
     }
 
+    /// Returns a sampler of a view of 8 × 8 pixels.
+    fn sampler(importance: Importance, in_epochs: bool, precrop_bundles: u64) -> PixelSampler {
+        let views = vec![ViewPixels { width: 8, height: 8, start: 0 }];
+        PixelSampler { views, index_count: 64, importance, in_epochs, precrop_bundles, seed: 3 }
+    }
+
     /// Masked pixels are never drawn, and the mean weight of the others is 1.
     #[test]
     fn importance_sampling_under_a_mask_keeps_the_expectation() {
-        let view = ViewPixels { width: 8, height: 8, start: 0 };
         let detailed = (0..64).map(|pixel| pixel % 8 == 1).collect();
         let importance = Importance::new(10.0, (64, 32), detailed);
-        let sampler = PixelSampler::new(vec![view], 64, importance, (false, 0), 3);
+        let sampler = sampler(importance, false, 0);
         let (mut counts, draws) = ([0u32; 64], 400_000);
         for bundle in 0..draws {
             counts[sampler.draw(bundle, |_, pixel| pixel % 8 < 4).1] += 1;
@@ -290,9 +278,8 @@ mod tests {
     /// Bundles of the precrop are drawn from the middle half, and never from masked pixels there.
     #[test]
     fn precrop_draws_unmasked_pixels_of_the_middle() {
-        let view = ViewPixels { width: 8, height: 8, start: 0 };
         let importance = Importance::new(1.0, (64, 64), PixelSet::default());
-        let sampler = PixelSampler::new(vec![view], 64, importance, (true, 1000), 3);
+        let sampler = sampler(importance, true, 1000);
         for bundle in 0..1000 {
             let (_, pixel) = sampler.draw(bundle, |_, pixel| pixel % 8 < 4);
             let (x, y) = (pixel % 8, pixel / 8);

@@ -1,12 +1,14 @@
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use pixels::psnr_of;
-use radiance::{CurvePoint, StepReport, TrainingLog};
+use radiance::{CurvePoint, StepReport, TrainingLog, TrainingState};
 use serde::{Deserialize, Serialize};
 use stage::CheckpointSchedule;
 
 use super::field_trainer::FieldTrainer;
+use crate::state::{HrCache, SupervisionState};
 use crate::supervision::Supersampling;
 
 /// File name of a trainer's checkpoint.
@@ -47,11 +49,11 @@ impl Curve {
         last.map(|p| format!("PSNR of training pixels {:.2} dB", p.psnr)).unwrap_or_default()
     }
 
-    pub(crate) fn finish(self, steps: u64, rays: u64) -> TrainingLog {
+    pub(crate) fn finish(self, state: &TrainingState) -> TrainingLog {
         TrainingLog {
-            steps,
-            rays,
-            samples_per_ray: self.samples as f64 / rays.max(1) as f64,
+            steps: state.steps,
+            rays: state.rays,
+            samples_per_ray: self.samples as f64 / state.rays.max(1) as f64,
             curve: self.points,
             ..TrainingLog::default()
         }
@@ -59,8 +61,8 @@ impl Curve {
 }
 
 /// Checkpoints in the work folder. A checkpoint has three files, written in this order:
-/// `curve-STEP.json`; `kept-STEP.bin`, the supervision's state; `checkpoint.safetensors`. The step
-/// in the last one decides which of the others belong to it.
+/// `curve-STEP.json`, the curve and the supervision's state; `kept-STEP.bin`, the HR cache;
+/// `checkpoint.safetensors`. The step in the last one decides which of the others belong to it.
 pub(crate) struct Checkpoints {
     folder: Option<PathBuf>,
     schedule: CheckpointSchedule,
@@ -71,37 +73,39 @@ impl Checkpoints {
         Self { folder: folder.map(Path::to_path_buf), schedule: CheckpointSchedule::default() }
     }
 
-    /// Resumes from the checkpoint of an earlier run, if any. An incomplete checkpoint is logged
-    /// and skipped, and the training starts over. Fails if a complete one can't be read.
+    /// Creates a trainer, and resumes from the checkpoint of an earlier run, if any. An incomplete
+    /// checkpoint is logged and skipped, and the training starts over. Fails if a complete one
+    /// can't be read.
     pub(crate) fn resume(
         &self,
-        trainer: &mut dyn FieldTrainer,
+        new_trainer: impl Fn() -> anyhow::Result<Box<dyn FieldTrainer>>,
         supervision: &mut Supersampling,
-        log: impl Fn(&str),
-    ) -> anyhow::Result<Curve> {
-        let Some(folder) = &self.folder else { return Ok(Curve::default()) };
-        let path = folder.join(CHECKPOINT);
-        if !path.exists() {
-            return Ok(Curve::default());
-        }
-        let complete = read_curve(&path, trainer).and_then(|(step, curve)| {
-            let state = std::fs::File::open(folder.join(state_name(step))).ok()?;
-            let is_complete =
-                state.metadata().ok()?.len() == supervision.state.byte_length() as u64;
-            (is_complete && trainer.resume(&path)).then_some((state, curve))
-        });
-        let Some((mut state, curve)) = complete else {
-            log(&format!("{}: incomplete checkpoint; starting over", path.display()));
-            return Ok(Curve::default());
+        log: impl Fn(String),
+    ) -> anyhow::Result<(Box<dyn FieldTrainer>, Curve)> {
+        let mut trainer = new_trainer()?;
+        let path = self.folder.as_ref().map(|folder| folder.join(CHECKPOINT));
+        let Some(path) = path.filter(|path| path.exists()) else {
+            return Ok((trainer, Curve::default()));
         };
-        // The trainer is already restored. Without the supervision's state, training would neither
-        // continue the earlier run nor start over.
-        supervision.restore(&mut state).with_context(|| {
-            let path = folder.join(state_name(trainer.steps()));
-            format!("cannot read {}; delete it to start the training over", path.display())
+        let own = &supervision.state;
+        let cache_bytes = own.cache.as_ref().map_or(0, HrCache::byte_length) as u64;
+        let complete = read_saved(&path, &mut *trainer).and_then(|(curve, state)| {
+            let cache_path = path.with_file_name(cache_name(trainer.state().steps));
+            let cache = File::open(&cache_path).ok()?;
+            let is_complete = cache.metadata().ok()?.len() == cache_bytes
+                && state.view_counts() == own.view_counts();
+            is_complete.then_some((curve, state, cache, cache_path))
+        });
+        let Some((curve, state, mut cache, cache_path)) = complete else {
+            log(format!("{}: incomplete checkpoint; starting over", path.display()));
+            drop(trainer);
+            return Ok((new_trainer()?, Curve::default()));
+        };
+        supervision.restore(state, &mut cache).with_context(|| {
+            format!("cannot read {}; delete it to start the training over", cache_path.display())
         })?;
-        log(&format!("resuming from step {}", trainer.steps()));
-        Ok(curve)
+        log(format!("resuming from step {}", trainer.state().steps));
+        Ok((trainer, curve))
     }
 
     /// Writes a checkpoint if one is due or the run is interrupted, and there is a work folder.
@@ -129,10 +133,13 @@ fn write(
     curve: &Curve,
 ) -> anyhow::Result<()> {
     let partial = folder.join("checkpoint.partial");
-    let step = trainer.steps();
-    let files = [curve_name(step), state_name(step)];
-    artifact::write_json_atomically(&folder.join(&files[0]), curve)?;
-    supervision.state.write(&mut std::fs::File::create(&partial)?)?;
+    let step = trainer.state().steps;
+    let files = [curve_name(step), cache_name(step)];
+    artifact::write_json_atomically(&folder.join(&files[0]), &(curve, &supervision.state))?;
+    let mut cache_file = File::create(&partial)?;
+    if let Some(cache) = &supervision.state.cache {
+        cache.write(&mut cache_file)?;
+    }
     publish(&partial, &folder.join(&files[1]))?;
     trainer.write_checkpoint(&partial)?;
     publish(&partial, &folder.join(CHECKPOINT))?;
@@ -148,7 +155,7 @@ fn write(
 
 /// Renames a complete file after its bytes are on the disk.
 fn publish(partial: &Path, path: &Path) -> std::io::Result<()> {
-    std::fs::File::open(partial)?.sync_all()?;
+    File::open(partial)?.sync_all()?;
     std::fs::rename(partial, path)
 }
 
@@ -159,21 +166,26 @@ pub(crate) fn read_latest(work: &Path, trainer: &mut dyn FieldTrainer) -> Option
     let latest = files
         .filter(|entry| entry.file_name() == CHECKPOINT)
         .max_by_key(|entry| entry.metadata().ok().and_then(|metadata| metadata.modified().ok()))?;
-    let (_, curve) = read_curve(latest.path(), trainer)?;
-    trainer.resume(latest.path()).then_some(curve)
+    read_saved(latest.path(), trainer).map(|(curve, _)| curve)
 }
 
 fn curve_name(step: u64) -> String {
     format!("curve-{step}.json")
 }
 
-fn state_name(step: u64) -> String {
+fn cache_name(step: u64) -> String {
     format!("kept-{step}.bin")
 }
 
-/// Returns a checkpoint's step and curve.
-fn read_curve(checkpoint: &Path, trainer: &dyn FieldTrainer) -> Option<(u64, Curve)> {
-    let step = trainer.checkpoint_step(checkpoint)?;
-    let bytes = std::fs::read(checkpoint.with_file_name(curve_name(step))).ok()?;
-    Some((step, serde_json::from_slice(&bytes).ok()?))
+/// Restores a trainer, and reads the checkpoint's curve and state; `None` if the checkpoint is
+/// incomplete, in which case the trainer may have been restored.
+fn read_saved(
+    checkpoint: &Path,
+    trainer: &mut dyn FieldTrainer,
+) -> Option<(Curve, SupervisionState)> {
+    if !trainer.resume(checkpoint) {
+        return None;
+    }
+    let curve = checkpoint.with_file_name(curve_name(trainer.state().steps));
+    serde_json::from_slice(&std::fs::read(curve).ok()?).ok()
 }

@@ -2,8 +2,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _};
-use fields::FieldModel;
-use radiance::{Field, RayField, StepReport, Trainer, TrainingError};
+use radiance::{Field, RayField, StepReport, Trainer, TrainingState};
 use scene::Bounds;
 
 use crate::params::{Resolved, ResolvedField};
@@ -15,19 +14,15 @@ pub(crate) trait FieldTrainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>>;
     /// Returns the current field.
     fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>>;
-    /// Returns the number of steps taken.
-    fn steps(&self) -> u64;
-    /// Returns the number of rays cast.
-    fn rays_done(&self) -> u64;
-    /// Returns the step of a checkpoint; `None` if the checkpoint is incomplete.
-    fn checkpoint_step(&self, path: &Path) -> Option<u64>;
+    /// Returns the progress of the training.
+    fn state(&self) -> &TrainingState;
     /// Writes a checkpoint.
     fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()>;
-    /// Resumes from a checkpoint and returns whether that succeeded. On failure the trainer is
-    /// unchanged, unless libtorch failed.
+    /// Resumes from a checkpoint and returns whether that succeeded.
     fn resume(&mut self, path: &Path) -> bool;
-    /// Ends the training and writes the field's weights.
-    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()>;
+    /// Ends the training and writes the field's weights, or their mean with those of a file `init`
+    /// (design note 020).
+    fn finish(self: Box<Self>, weights: &Path, init: Option<&Path>) -> anyhow::Result<()>;
 }
 
 /// Creates a trainer of a new field, or of one initialised from the weights `init`. A grid is
@@ -82,46 +77,13 @@ pub(crate) fn new_trainer(
     }
 }
 
-/// Replaces trained weights by their mean with the initial ones (design note 020).
-pub(crate) fn average_weights(
-    model: FieldModel,
-    bounds: Bounds,
-    init: &Path,
-    trained: &Path,
-) -> anyhow::Result<()> {
-    match model {
-        FieldModel::Grid(architecture) => {
-            let mut field = Field::read(trained, architecture, bounds)?;
-            field.average_with(&Field::read(init, architecture, bounds)?);
-            field.write(trained)?;
-        }
-        #[cfg(feature = "torch")]
-        FieldModel::Mlp(architecture) => {
-            let device = nets::device("cpu")?;
-            let field = torch_field::Mlp::read(trained, architecture, bounds, device)?;
-            field.average_with(&torch_field::Mlp::read(init, architecture, bounds, device)?)?;
-            field.write(trained)?;
-        }
-        // `new_trainer` has refused to train MLPs.
-        #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {}
-    }
-    Ok(())
-}
+const CANNOT_AVERAGE: &str = "cannot average the weights";
 
 /// Implements the methods of [`FieldTrainer`] that all trainers have under the same names.
 macro_rules! forwarded {
     () => {
-        fn steps(&self) -> u64 {
-            Self::steps(self)
-        }
-
-        fn rays_done(&self) -> u64 {
-            Self::rays_done(self)
-        }
-
-        fn checkpoint_step(&self, path: &Path) -> Option<u64> {
-            Self::checkpoint_step(path).ok()
+        fn state(&self) -> &TrainingState {
+            Self::state(self)
         }
 
         fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
@@ -136,9 +98,7 @@ macro_rules! forwarded {
 
 impl FieldTrainer for Trainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
-        Self::step(self, supervision).map_err(|e| match e {
-            TrainingError::NotFinite { .. } => Failure::Numerical(e.to_string()).into(),
-        })
+        Self::step(self, supervision).map_err(|e| Failure::Numerical(e.to_string()).into())
     }
 
     fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>> {
@@ -147,14 +107,20 @@ impl FieldTrainer for Trainer {
 
     forwarded!();
 
-    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        let steps = Self::steps(&self);
-        write_grid(Self::finish(*self), steps, weights)
+    fn finish(self: Box<Self>, weights: &Path, init: Option<&Path>) -> anyhow::Result<()> {
+        let steps = Self::state(&self).steps;
+        write_grid(Self::finish(*self), steps, weights, init)
     }
 }
 
-/// Writes a grid without its specks; fails if a parameter isn't finite.
-fn write_grid(mut field: Field, steps: u64, weights: &Path) -> anyhow::Result<()> {
+/// Writes a grid without its specks, averaged with the weights `init`; fails if a parameter isn't
+/// finite.
+fn write_grid(
+    mut field: Field,
+    steps: u64,
+    weights: &Path,
+    init: Option<&Path>,
+) -> anyhow::Result<()> {
     if !field.is_finite() {
         return Err(Failure::Numerical(format!(
             "step {steps}: a parameter is not finite; lower the learning rate"
@@ -162,6 +128,10 @@ fn write_grid(mut field: Field, steps: u64, weights: &Path) -> anyhow::Result<()
         .into());
     }
     field.remove_specks();
+    if let Some(init) = init {
+        let init = Field::read(init, field.architecture, field.bounds);
+        field.average_with(&init.context(CANNOT_AVERAGE)?);
+    }
     field.write(weights).context("cannot write the field")
 }
 
@@ -177,8 +147,8 @@ impl FieldTrainer for torch_field::GridTrainer {
 
     forwarded!();
 
-    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        write_grid(self.field()?, Self::steps(&self), weights)
+    fn finish(self: Box<Self>, weights: &Path, init: Option<&Path>) -> anyhow::Result<()> {
+        write_grid(Self::field(&self)?, Self::state(&self).steps, weights, init)
     }
 }
 
@@ -205,8 +175,12 @@ impl FieldTrainer for torch_field::MlpTrainer {
 
     forwarded!();
 
-    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        Self::field(&self).write(weights).context("cannot write the field")
+    fn finish(self: Box<Self>, weights: &Path, init: Option<&Path>) -> anyhow::Result<()> {
+        let field = Self::field(&self);
+        if let Some(init) = init {
+            field.average_with(init).context(CANNOT_AVERAGE)?;
+        }
+        field.write(weights).context("cannot write the field")
     }
 }
 
@@ -237,7 +211,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("field.safetensors");
         let Field { architecture, bounds, .. } = field();
-        write_grid(field(), 7, &path).unwrap();
+        write_grid(field(), 7, &path, None).unwrap();
         let read = Field::read(&path, architecture, bounds).unwrap();
         let (.., occupancy) = read.parts();
         let cells = occupancy.to_bytes();
@@ -251,7 +225,7 @@ mod tests {
         let path = folder.path().join("field.safetensors");
         let mut field = field();
         field.parts_mut().0[3] = f32::NAN;
-        let error = write_grid(field, 7, &path).unwrap_err();
+        let error = write_grid(field, 7, &path, None).unwrap_err();
         assert!(matches!(error.downcast_ref::<Failure>(), Some(Failure::Numerical(_))));
         assert!(!path.exists());
     }

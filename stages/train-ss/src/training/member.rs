@@ -9,9 +9,9 @@ use scene::{Bounds, Views};
 use stage::{Context, Progress};
 
 use super::checkpoint::{Checkpoints, Curve, read_latest};
-use super::field_trainer::{FieldTrainer, average_weights, new_trainer};
+use super::field_trainer::{FieldTrainer, new_trainer};
 use super::time_left::{TimeLeft, TrainingRays};
-use crate::params::{Combine, Exposure, Resolved};
+use crate::params::{Combine, Resolved};
 use crate::supervision::{Supersampling, set_up_supervision};
 
 /// Inputs of a training run, and its progress bar.
@@ -109,8 +109,8 @@ impl<'a> Member<'a> {
         let curve = read_latest(work, &mut *trainer).ok_or_else(|| {
             Failure::BadInput(format!("--work {}: no complete checkpoint yet", work.display()))
         })?;
-        let log = curve.finish(trainer.steps(), trainer.rays_done());
-        self.write_weights(trainer, bounds)?;
+        let log = curve.finish(trainer.state());
+        self.write_weights(trainer)?;
         Ok(log)
     }
 
@@ -127,7 +127,7 @@ impl<'a> Member<'a> {
     /// differences by floaters (design note 026).
     fn train(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         let with_exposures = self.with_exposures();
-        if self.params.exposure == Exposure::ByScene && with_exposures.has_started() {
+        if self.params.exposure.is_none() && with_exposures.has_started() {
             return with_exposures.run(data);
         }
         let mut training = self.start(data)?;
@@ -135,14 +135,14 @@ impl<'a> Member<'a> {
             drop(training);
             return with_exposures.run(data);
         }
-        self.finish(training, data.views.bounds)
+        self.finish(training)
     }
 
     /// Returns a copy that estimates exposures, with its checkpoints in a subfolder, which also
     /// marks the measurement as done.
     fn with_exposures(&self) -> Self {
         let mut member = self.clone();
-        member.params.exposure = Exposure::On;
+        member.params.exposure = Some(true);
         member.work = self.work.as_ref().map(|work| work.join("exposures"));
         member
     }
@@ -181,10 +181,9 @@ impl<'a> Member<'a> {
         }
         // While cameras move, their silhouettes would empty wrong cells.
         let cells = cells.filter(|_| !params.pose_refinement);
-        let mut trainer = self.new_trainer(views.bounds, cells)?;
         let checkpoints = Checkpoints::new(work);
-        let curve = checkpoints
-            .resume(&mut *trainer, &mut supervision, |text| self.context.log_line(text))?;
+        let new_trainer = || self.new_trainer(views.bounds, cells);
+        let (trainer, curve) = checkpoints.resume(new_trainer, &mut supervision, log)?;
         Ok(Training { trainer, supervision, checkpoints, curve })
     }
 
@@ -202,7 +201,7 @@ impl<'a> Member<'a> {
             let is_interrupted = self.context.is_interrupted();
             checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
             let Some(report) = trainer.step(supervision)? else { return Ok(Outcome::Complete) };
-            if let Some(error) = supervision.first_error() {
+            if let Some(error) = supervision.memory.first_error() {
                 let folder = self.pixel_folder().display();
                 anyhow::bail!(
                     "cannot read or write the training pixels in {folder}: {error}; check the \
@@ -212,10 +211,10 @@ impl<'a> Member<'a> {
             if report.skipped {
                 self.context.log_line(format!(
                     "step {}: a value was not finite; step discarded, learning rates halved",
-                    trainer.steps()
+                    trainer.state().steps
                 ));
             }
-            let rays = trainer.rays_done();
+            let rays = trainer.state().rays;
             if let Some(difference) = supervision.exposure_difference(rays as f64 / total as f64) {
                 if difference.is_clear() || difference.is_last() {
                     self.context.log_line(difference.to_string());
@@ -232,15 +231,15 @@ impl<'a> Member<'a> {
                 remaining: total.saturating_sub(rays),
                 further: data.total_rays.saturating_sub(self.rays_before + total),
             };
-            data.progress.set_seconds_left(time_left.seconds(trainer.steps(), rays_left));
+            data.progress.set_seconds_left(time_left.seconds(trainer.state().steps, rays_left));
             data.progress.set(self.rays_before + rays, &curve.last_psnr());
         }
     }
 
     /// Ends a training: writes the weights, and stores weights and log for a later run.
-    fn finish(&self, training: Training, bounds: Bounds) -> anyhow::Result<TrainingLog> {
+    fn finish(&self, training: Training) -> anyhow::Result<TrainingLog> {
         let Training { trainer, supervision, curve, .. } = training;
-        let mut log = curve.finish(trainer.steps(), trainer.rays_done());
+        let mut log = curve.finish(trainer.state());
         if let Some(motion) = supervision.mean_motion(|| trainer.field())? {
             self.context.log_line(format!("cameras have {motion}"));
             if motion.exceeds_usual_error() {
@@ -250,7 +249,7 @@ impl<'a> Member<'a> {
         log.exposures = supervision.exposures().to_vec();
         log.poses =
             supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
-        self.write_weights(trainer, bounds)?;
+        self.write_weights(trainer)?;
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS))
                 .context("cannot copy the field")?;
@@ -270,13 +269,11 @@ impl<'a> Member<'a> {
     }
 
     /// Writes the trained weights, averaged with the initial ones if requested.
-    fn write_weights(&self, trainer: Box<dyn FieldTrainer>, bounds: Bounds) -> anyhow::Result<()> {
-        trainer.finish(&self.output)?;
-        if let Some((init, Combine::AverageWeights)) = &self.init {
-            average_weights(self.model, bounds, init, &self.output)
-                .context("cannot average the weights")?;
+    fn write_weights(&self, trainer: Box<dyn FieldTrainer>) -> anyhow::Result<()> {
+        match &self.init {
+            Some((init, Combine::AverageWeights)) => trainer.finish(&self.output, Some(init)),
+            _ => trainer.finish(&self.output, None),
         }
-        Ok(())
     }
 }
 

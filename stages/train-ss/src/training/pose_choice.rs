@@ -34,7 +34,10 @@ pub(crate) fn train_with_best_poses(
     let refined = member.variant(true, "refined", refined_weights.clone(), 0).run(data)?;
     let mut given = member.variant(false, "given", weights.clone(), refined.rays).run(data)?;
     given.poses = data.views.views.iter().map(|view| view.camera.camera_to_world).collect();
-    let judge = PoseJudge::new(member, data)?;
+    let photographs = Photographs::read(data.input, usize::MAX, &mut PixelMemory::unlimited())?;
+    let photographs = photographs.over_background();
+    let photographs = photographs.images.iter().map(PackedPhotograph::masked).collect();
+    let judge = PoseJudge { member, data, photographs };
     let refined_error = judge.error(&refined_weights, &refined)?;
     let given_error = judge.error(weights, &given)?;
     let [refined_psnr, given_psnr] = [refined_error, given_error].map(|error| {
@@ -62,23 +65,11 @@ pub(crate) fn train_with_best_poses(
 struct PoseJudge<'a> {
     member: &'a Member<'a>,
     data: &'a TrainingData<'a>,
+    /// Photographs over the background.
     photographs: Vec<Image>,
-    background: f32,
 }
 
-impl<'a> PoseJudge<'a> {
-    fn new(member: &'a Member<'a>, data: &'a TrainingData<'a>) -> anyhow::Result<Self> {
-        let photographs = Photographs::read(data.input, usize::MAX, &mut PixelMemory::unlimited())?
-            .over_background();
-        let background = photographs.views.background.grey_level();
-        Ok(Self {
-            member,
-            data,
-            photographs: photographs.images.iter().map(PackedPhotograph::masked).collect(),
-            background,
-        })
-    }
-
+impl PoseJudge<'_> {
     /// Returns the mean squared error between photographs and their neighbours, warped by a trained
     /// field's depth; `None` if no pixels are comparable.
     fn error(&self, weights: &Path, log: &TrainingLog) -> anyhow::Result<Option<f64>> {
@@ -95,6 +86,7 @@ impl<'a> PoseJudge<'a> {
             let exposure = log.exposures.get(i).map_or([1.0; 3], |gain| gain.map(f32::recip));
             posed.push(PosedPhotograph { camera, image: &self.photographs[i], exposure });
         }
-        photometric_error(&*field, &posed, self.background).map_err(fields::rendering_failure)
+        let background = self.data.views.background.grey_level();
+        photometric_error(&*field, &posed, background).map_err(fields::rendering_failure)
     }
 }

@@ -1,4 +1,4 @@
-use radiance::{Architecture, OutOfRange, check_ranges};
+use radiance::{Architecture, DescriptionError, check_ranges};
 use scene::{Background, Bounds};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -37,20 +37,6 @@ fn first_format() -> u32 {
     1
 }
 
-/// Error returned when a field's description is invalid.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum FieldFileError {
-    /// A number is out of range.
-    #[error(transparent)]
-    OutOfRange(#[from] OutOfRange),
-    /// The file has another format.
-    #[error(
-        "field has format {0} of another build; this build reads format {FIELD_FORMAT}: train the \
-        field again"
-    )]
-    Format(u32),
-}
-
 impl FieldFile {
     /// Returns the name of a member's weights file, next to [`FIELD_FILE`].
     pub fn member_file(index: u32) -> String {
@@ -58,14 +44,16 @@ impl FieldFile {
     }
 
     /// Fails with the first number that is out of range, or with a format that can't be read.
-    pub fn check(&self) -> Result<(), FieldFileError> {
+    pub fn check(&self) -> Result<(), DescriptionError> {
         check_ranges(&[("members", self.members, 1, 16)])?;
         match self.field {
-            FieldModel::Grid(_) if self.format != FIELD_FORMAT => {
-                Err(FieldFileError::Format(self.format))
-            }
-            FieldModel::Grid(architecture) => Ok(architecture.check()?),
-            FieldModel::Mlp(architecture) => Ok(architecture.check()?),
+            FieldModel::Grid(_) if self.format != FIELD_FORMAT => Err(DescriptionError(format!(
+                "field has format {} of another build; this build reads format {FIELD_FORMAT}: \
+                train the field again",
+                self.format
+            ))),
+            FieldModel::Grid(architecture) => architecture.check(),
+            FieldModel::Mlp(architecture) => architecture.check(),
         }
     }
 }

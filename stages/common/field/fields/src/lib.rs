@@ -25,7 +25,7 @@ use radiance::{Field, Pixel, PointField, Ray, RayField, RenderError};
 use rayon::prelude::*;
 use scene::{Background, Bounds, Camera};
 
-pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel};
+pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldModel};
 
 /// Environment variables that change renders. Builds without libtorch list them, too, so that keys
 /// agree. If 1, `TORCH_ALLOW_TF32_CUBLAS_OVERRIDE` lets CUDA multiply in TensorFloat-32, with a

@@ -8,27 +8,27 @@ use std::sync::atomic::{AtomicU8, Ordering};
 /// Number of logical lanes of every kernel.
 pub const LANES: usize = 16;
 
-/// SIMD family of machine code.
+/// SIMD family of machine code; the discriminant is its code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Family {
     /// 512-bit vectors (x86-64-v4).
-    Avx512,
+    Avx512 = 0,
     /// 256-bit vectors with fused multiply-add (x86-64-v3).
-    Avx2,
+    Avx2 = 1,
     /// Instructions of the compilation target.
-    Portable,
+    Portable = 2,
 }
 
-/// Chosen family: 1 AVX-512, 2 AVX2, 3 portable; 0 before the first choice.
-static CHOSEN: AtomicU8 = AtomicU8::new(0);
+/// Code of the chosen [`Family`]; another number before the first choice.
+static CHOSEN: AtomicU8 = AtomicU8::new(u8::MAX);
 
 impl Family {
     /// Returns the family set with [`set_family`], by default the best that the machine supports.
     pub fn current() -> Self {
         match CHOSEN.load(Ordering::Relaxed) {
-            1 => Self::Avx512,
-            2 => Self::Avx2,
-            3 => Self::Portable,
+            0 => Self::Avx512,
+            1 => Self::Avx2,
+            2 => Self::Portable,
             _ => {
                 let best = [Self::Avx512, Self::Avx2]
                     .into_iter()
@@ -65,12 +65,7 @@ impl Family {
 /// doesn't support is ignored.
 pub fn set_family(family: Family) {
     if family.is_supported() {
-        let code = match family {
-            Family::Avx512 => 1,
-            Family::Avx2 => 2,
-            Family::Portable => 3,
-        };
-        CHOSEN.store(code, Ordering::Relaxed);
+        CHOSEN.store(family as u8, Ordering::Relaxed);
     }
 }
 

@@ -44,11 +44,11 @@ mod pyramid;
 use std::fmt;
 
 use glam::{DMat3, DQuat, DVec3};
-use radiance::{Pixel, Ray, RayField, RenderError};
-use scene::{Camera, CameraRay, format_length, pose_of};
+use radiance::{Pixel, RayField, RenderError};
+use scene::{Camera, format_length, pose_of};
 
 use crate::normal_matrix::{HUBER_THRESHOLD, NormalMatrix, huber};
-use crate::pyramid::{InformativePixel, PyramidLevel};
+use crate::pyramid::{InformativePixel, PyramidLevel, pixel_rays};
 
 pub use photometric::{PosedPhotograph, photometric_error};
 pub use pyramid::Pyramid;
@@ -99,7 +99,7 @@ pub fn refine(
     let (mut best, mut equations, mut damping) = (camera.clone(), start, FIRST_DAMPING);
     for _ in 1..options.max_renders {
         let Some(motion) = equations.solve(damping) else { break };
-        let moved = motion.applied_to(&best);
+        let moved = moved(&best, motion);
         let next = Equations::linearised(field, &moved, level, options)?;
         if next.error < equations.error {
             (best, equations, damping) = (moved, next, damping / 4.0);
@@ -142,10 +142,7 @@ impl Equations {
         options: &Options,
     ) -> Result<Self, RenderError> {
         let camera = camera.resized(level.width as u32, level.height as u32);
-        let camera_rays: Vec<CameraRay> =
-            level.pixels.iter().map(|p| camera.ray(p.x as f64 + 0.5, p.y as f64 + 0.5)).collect();
-        let rays: Vec<Ray> =
-            camera_rays.iter().map(|ray| Ray::new(ray, [options.background; 3])).collect();
+        let (camera_rays, rays) = pixel_rays(&camera, &level.pixels, options.background);
         let renders = field.render(&rays)?;
         let depths: Vec<Option<f64>> = (0..renders.len())
             .map(|i| trusted_depth(&renders[i], camera.depth_per_distance(&camera_rays[i])))
@@ -195,13 +192,14 @@ impl Equations {
         }
     }
 
-    /// Returns the motion that minimises the error; `None` if too few pixels have a depth.
-    fn solve(&self, damping: f64) -> Option<Motion> {
+    /// Returns the motion that minimises the error, for [`moved`]; `None` if too few pixels have a
+    /// depth.
+    fn solve(&self, damping: f64) -> Option<[DVec3; 2]> {
         if self.pixels < MIN_PIXELS || !self.error.is_finite() {
             return None;
         }
         let [rotation, translation] = self.matrix.damped(damping).solve(self.right_sides)?;
-        Some(Motion { rotation, translation: self.unit * translation })
+        Some([rotation, self.unit * translation])
     }
 }
 
@@ -230,19 +228,10 @@ fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [[D
     [right, down].map(|along| [along.cross(point), -unit * along])
 }
 
-/// Motion of a camera in its own axes.
-#[derive(Clone, Copy, Debug)]
-struct Motion {
-    /// Axis times angle, in radians.
-    rotation: DVec3,
-    translation: DVec3,
-}
-
-impl Motion {
-    fn applied_to(&self, camera: &Camera) -> Camera {
-        let rotated = rotation(camera) * DQuat::from_scaled_axis(self.rotation);
-        with_pose(camera, rotated, camera.centre() + camera.rotation() * self.translation)
-    }
+/// Moves a camera: `turn` is axis times angle in radians; both vectors are in the camera's axes.
+fn moved(camera: &Camera, [turn, translation]: [DVec3; 2]) -> Camera {
+    let rotated = rotation(camera) * DQuat::from_scaled_axis(turn);
+    with_pose(camera, rotated, camera.centre() + camera.rotation() * translation)
 }
 
 fn rotation(camera: &Camera) -> DQuat {

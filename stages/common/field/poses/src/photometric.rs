@@ -4,7 +4,7 @@ use radiance::{Pixel, Ray, RayField, RenderError};
 use scene::Camera;
 
 use crate::normal_matrix::huber;
-use crate::pyramid::PyramidLevel;
+use crate::pyramid::{PyramidLevel, pixel_rays};
 
 /// Photograph with the camera that took it.
 #[derive(Clone, Copy, Debug)]
@@ -71,11 +71,7 @@ fn surface_points(
     let pixels = PyramidLevel::new(photograph.image).pixels;
     let stride = pixels.len().div_ceil(MAX_PIXELS_PER_VIEW).max(1);
     let pixels: Vec<_> = pixels.into_iter().step_by(stride).collect();
-    let lines: Vec<_> = pixels
-        .iter()
-        .map(|pixel| photograph.camera.ray(pixel.x as f64 + 0.5, pixel.y as f64 + 0.5))
-        .collect();
-    let rays: Vec<_> = lines.iter().map(|line| Ray::new(line, [background; 3])).collect();
+    let (lines, rays) = pixel_rays(photograph.camera, &pixels, background);
     let mut points = Vec::new();
     for (i, render) in field.render(&rays)?.into_iter().enumerate() {
         if has_surface(&render) && render.median_depth.is_finite() {

@@ -1,4 +1,6 @@
 use pixels::{Filter, Image, Resampling};
+use radiance::Ray;
+use scene::{Camera, CameraRay};
 
 /// Photograph at several sizes.
 #[derive(Clone, Debug)]
@@ -83,6 +85,20 @@ impl PyramidLevel {
         let stride = pixels.len().div_ceil(MAX_LEVEL_PIXELS).max(1);
         Self { width, height, pixels: pixels.into_iter().step_by(stride).collect() }
     }
+}
+
+/// Returns the rays through the centres of a camera's pixels, without and with a grey background.
+pub(crate) fn pixel_rays(
+    camera: &Camera,
+    pixels: &[InformativePixel],
+    background: f32,
+) -> (Vec<CameraRay>, Vec<Ray>) {
+    let rays = pixels.iter().map(|pixel| {
+        let [x, y] = pixel.centre();
+        let ray = camera.ray(x, y);
+        (ray, Ray::new(&ray, [background; 3]))
+    });
+    rays.unzip()
 }
 
 /// Returns a pixel that is not on the border if its neighbourhood is known and has a gradient.

@@ -46,7 +46,7 @@ impl Architecture {
     }
 
     /// Fails with the first number that is out of range. The ranges are chosen by hand.
-    pub fn check(&self) -> Result<(), OutOfRange> {
+    pub fn check(&self) -> Result<(), DescriptionError> {
         check_ranges(&[
             ("n_levels", self.n_levels, 1, 16),
             ("base_resolution", self.base_resolution, 2, 512),
@@ -134,25 +134,16 @@ impl GivenSizes {
     }
 }
 
-/// Error returned when a number is out of range.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{name} = {value} is not in {low}..={high}")]
-pub struct OutOfRange {
-    /// Name of the number.
-    pub name: &'static str,
-    /// Value found.
-    pub value: u32,
-    /// Minimum value.
-    pub low: u32,
-    /// Maximum value.
-    pub high: u32,
-}
+/// Error returned when a field's description can't be used, with the reason.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct DescriptionError(pub String);
 
 /// Fails with the first of (name, value, minimum, maximum) whose value is out of range.
-pub fn check_ranges(ranges: &[(&'static str, u32, u32, u32)]) -> Result<(), OutOfRange> {
+pub fn check_ranges(ranges: &[(&'static str, u32, u32, u32)]) -> Result<(), DescriptionError> {
     for &(name, value, low, high) in ranges {
         if !(low..=high).contains(&value) {
-            return Err(OutOfRange { name, value, low, high });
+            return Err(DescriptionError(format!("{name} = {value} is not in {low}..={high}")));
         }
     }
     Ok(())

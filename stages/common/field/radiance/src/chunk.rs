@@ -5,7 +5,6 @@ use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::grid::PositionRows;
 use crate::march::March;
-use crate::occupancy::CellHit;
 use crate::ray::NormalizedRay;
 use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
 use crate::shading::{LayerInput, NetworkGradients, RayGradients, Shading, dot};
@@ -52,8 +51,10 @@ pub(crate) struct Roulette {
 #[derive(Debug, Default)]
 pub(crate) struct Chunk {
     pub(crate) sums: Vec<RaySum>,
-    samples: Samples,
-    counted: Counted,
+    /// Samples marched in the last forward pass.
+    pub(crate) samples: Samples,
+    /// Those of the samples that have a colour.
+    pub(crate) counted: Counted,
     shading: Shading,
     backward: BackwardBuffers,
 }
@@ -184,21 +185,6 @@ impl Chunk {
         shading.backward(field, (samples, counted, sums), upstream, network, gradients);
         backward.choose(samples, counted, roulette);
         backward.run(field, samples, network, into);
-    }
-
-    /// Lists the densities and cells of samples of the last forward pass that stop light.
-    pub(crate) fn list_hits(&self, step: f32, hits: &mut Vec<CellHit>) {
-        self.samples.list_hits(&self.counted, step, hits);
-    }
-
-    /// Returns the number of samples marched in the last forward pass.
-    pub(crate) fn samples(&self) -> usize {
-        self.samples.count
-    }
-
-    /// Returns the number of samples with a colour in the last forward pass.
-    pub(crate) fn coloured_samples(&self) -> usize {
-        self.counted.sample.len()
     }
 }
 

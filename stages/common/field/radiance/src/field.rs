@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use numerics::CounterRng;
-use safetensors::SafeTensors;
+use safetensors::{Dtype, SafeTensors};
 use scene::Bounds;
 
 use crate::aligned::Aligned;
@@ -10,9 +10,7 @@ use crate::grid::{Level, levels};
 use crate::mlp::Layers;
 use crate::occupancy::{CELLS, Cell, Occupancy};
 use crate::spec::FEATURES;
-use crate::tensors::{
-    FieldError, FieldProblem, Tensor, read_f32, read_tensors, read_u8, write_tensors,
-};
+use crate::tensors::{FieldError, floats, read_tensor, read_tensors, write_tensors};
 use numerics::simd::LANES;
 
 /// Radiance field: density and view-dependent colour at every point of the unit cube.
@@ -120,13 +118,10 @@ impl Field {
     /// empty, 1 thin, 2 dense). It has no metadata, so equal fields have equal bytes.
     pub fn write(&self, path: &Path) -> Result<(), FieldError> {
         let occupancy = self.occupancy.to_bytes();
+        let occupancy = ("occupancy", Dtype::U8, &occupancy[..]);
         write_tensors(
             path,
-            &[
-                ("grid", Tensor::of_floats(&self.grid)),
-                ("network", Tensor::of_floats(&self.network)),
-                ("occupancy", Tensor::of_bytes(&occupancy)),
-            ],
+            &[floats("grid", &self.grid), floats("network", &self.network), occupancy],
         )
     }
 
@@ -137,10 +132,9 @@ impl Field {
         bounds: Bounds,
     ) -> Result<Self, FieldError> {
         read_tensors(path, |tensors| {
-            architecture.check()?;
+            architecture.check().map_err(|error| error.0)?;
             if !bounds.is_valid() {
-                let problem = format!("bounds {bounds:?} are empty or not finite");
-                return Err(FieldProblem::Unusable(problem));
+                return Err(format!("bounds {bounds:?} are empty or not finite"));
             }
             Self::from_tensors(tensors, architecture, bounds)
         })
@@ -150,14 +144,15 @@ impl Field {
         tensors: &SafeTensors<'_>,
         architecture: Architecture,
         bounds: Bounds,
-    ) -> Result<Self, FieldProblem> {
+    ) -> Result<Self, String> {
         let mut field = Self::empty(architecture, bounds);
-        read_f32(tensors, "grid", &mut field.grid)?;
-        read_f32(tensors, "network", &mut field.network)?;
-        let occupancy = read_u8(tensors, "occupancy", CELLS)?;
+        read_tensor(tensors, "grid", Dtype::F32, &mut field.grid)?;
+        read_tensor(tensors, "network", Dtype::F32, &mut field.network)?;
+        let mut occupancy = vec![0u8; CELLS];
+        read_tensor(tensors, "occupancy", Dtype::U8, &mut occupancy)?;
         field.occupancy.set(|cell| Cell::from_byte(occupancy[cell]));
         if !field.is_finite() {
-            return Err(FieldProblem::Unusable("a parameter is not finite".to_owned()));
+            return Err("a parameter is not finite".to_owned());
         }
         Ok(field)
     }

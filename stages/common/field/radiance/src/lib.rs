@@ -68,20 +68,20 @@ mod trainer;
 mod training_log;
 mod training_state;
 
-pub use architecture::{Architecture, CELLS_PER_PIXEL, GivenSizes, OutOfRange, check_ranges};
+pub use architecture::{Architecture, CELLS_PER_PIXEL, DescriptionError, GivenSizes, check_ranges};
 pub use field::Field;
 pub use math::spherical_harmonics;
 pub use occupancy::{CellHit, Occupancy};
 pub use passes::Passes;
-pub use points::{PointField, PointSample, PointSamples};
+pub use points::{PointField, PointSamples};
 pub use ray::{MAX_SPEED, NormalizedRay, Ray, RayMap, clip};
 pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};
 pub use spec::Strides;
-pub use tensors::{FieldError, FieldProblem};
+pub use tensors::FieldError;
 pub use trainer::{
-    NETWORK_DECAY, Phase, PhaseClock, PhaseTimes, RenderedBundles, StepReport, Supervisor, Trainer,
-    TrainingError, TrainingOptions,
+    NETWORK_DECAY, Phase, PhaseClock, PhaseTimes, RenderedBundles, Step, StepReport, Supervisor,
+    Trainer, TrainingError, TrainingOptions,
 };
 pub use training_log::{CurvePoint, TRAINING_FILE, TrainingLog};
 pub use training_state::TrainingState;

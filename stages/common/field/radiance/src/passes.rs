@@ -11,10 +11,10 @@ use crate::spec::Strides;
 /// with torch-field's hash grid (docs/design/023).
 #[derive(Debug)]
 pub struct Passes {
-    chunk: Chunk,
+    pub(crate) chunk: Chunk,
     transposed: Aligned,
     network_gradients: Vec<f32>,
-    feature_gradients: FeatureGradients,
+    pub(crate) feature_gradients: FeatureGradients,
     grid_gradients: Vec<LevelGradients>,
 }
 
@@ -43,8 +43,8 @@ impl Passes {
         for rays in rays.chunks(CHUNK_RAYS) {
             let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
             self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Single);
-            samples[0] += self.chunk.samples();
-            samples[1] += self.chunk.coloured_samples();
+            samples[0] += self.chunk.samples.count;
+            samples[1] += self.chunk.counted.sample.len();
             if backward {
                 let ones = [[1.0; 3]; CHUNK_RAYS];
                 let upstream = RayGradients {
@@ -52,20 +52,22 @@ impl Passes {
                     backgrounds: &ones,
                     regularisers: Regularisers::default(),
                 };
-                let mut network = NetworkGradients {
-                    transposed: &self.transposed,
-                    sums: &mut self.network_gradients,
-                };
-                self.chunk.backward(
-                    field,
-                    upstream,
-                    Roulette::default(),
-                    &mut network,
-                    &mut self.feature_gradients,
-                );
+                self.backward(field, upstream, Roulette::default());
             }
         }
         samples
+    }
+
+    /// Backpropagates gradients from the chunk's rays.
+    pub(crate) fn backward(
+        &mut self,
+        field: &Field,
+        upstream: RayGradients<'_>,
+        roulette: Roulette,
+    ) {
+        let (transposed, sums) = (&*self.transposed, &mut self.network_gradients[..]);
+        let mut network = NetworkGradients { transposed, sums };
+        self.chunk.backward(field, upstream, roulette, &mut network, &mut self.feature_gradients);
     }
 
     /// Adds the last backward pass's gradients of the grid's features to their sums.

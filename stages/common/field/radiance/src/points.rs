@@ -14,21 +14,11 @@ use crate::spec::{
 };
 use numerics::simd::LANES;
 
-/// Density and colour of a field at a point.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct PointSample {
-    /// Optical depth per unit of a ray's t ([`crate::NormalizedRay`]); 0 in an empty cell.
-    pub density: f32,
-    /// Red, green and blue before the sigmoid, without the view-dependent part.
-    pub raw_colour: [f32; 3],
-    /// View features: inputs of the view network, in addition to the direction.
-    pub view_features: [f32; VIEW_FEATURES],
-}
-
 /// Values of a field at some points.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointSamples {
-    /// Optical depth per unit of a ray's t at each point.
+    /// Optical depth per unit of a ray's t ([`crate::NormalizedRay`]) at each point; 0 in an empty
+    /// cell.
     pub densities: Vec<f32>,
     /// Red, green and blue of each point before the sigmoid, without the view-dependent part.
     pub raw_colours: Vec<[f32; 3]>,
@@ -66,7 +56,11 @@ pub trait PointField: Sync {
     ) -> Result<Vec<Vec<[f32; 3]>>, RenderError>;
 }
 
+/// Number of points per pass, whose activations fit the cache; chosen by hand.
+const POINTS_PER_PASS: usize = 256;
+
 impl PointField for Field {
+    /// Returns whether the box between the corners intersects an occupied cell.
     fn may_have_density(
         &self,
         low: [f32; 3],
@@ -77,15 +71,35 @@ impl PointField for Field {
     }
 
     fn densities(&self, points: &[[f32; 3]]) -> Result<Vec<f32>, RenderError> {
-        Ok(self.sample_points(points).iter().map(|sample| sample.density).collect())
+        Ok(self.samples(points)?.densities)
     }
 
     fn samples(&self, points: &[[f32; 3]]) -> Result<PointSamples, RenderError> {
-        let mut samples = PointSamples::default();
-        for sample in self.sample_points(points) {
-            samples.densities.push(sample.density);
-            samples.raw_colours.push(sample.raw_colour);
-            samples.view_features.extend(sample.view_features);
+        let mut samples = PointSamples {
+            densities: vec![0.0; points.len()],
+            raw_colours: vec![[0.0; 3]; points.len()],
+            view_features: vec![0.0; VIEW_FEATURES * points.len()],
+        };
+        let occupied: Vec<usize> =
+            (0..points.len()).filter(|&i| self.has_occupied_cell(points[i], points[i])).collect();
+        let mut rows = DensityRows::default();
+        for indices in occupied.chunks(POINTS_PER_PASS) {
+            let n = indices.len().next_multiple_of(LANES);
+            let mut positions = vec![0.0; 3 * n];
+            for (k, &i) in indices.iter().enumerate() {
+                for axis in 0..3 {
+                    positions[axis * n + k] = points[i][axis];
+                }
+            }
+            let outputs = rows.outputs_at(self, &positions, n);
+            for (k, &i) in indices.iter().enumerate() {
+                samples.densities[i] = exp(outputs[k].min(MAX_RAW_DENSITY));
+                samples.raw_colours[i] = [0, 1, 2].map(|c| outputs[(RAW_COLOUR + c) * n + k]);
+                for f in 0..VIEW_FEATURES {
+                    samples.view_features[VIEW_FEATURES * i + f] =
+                        outputs[(VIEW_FEATURE + f) * n + k];
+                }
+            }
         }
         Ok(samples)
     }
@@ -100,12 +114,8 @@ impl PointField for Field {
     }
 }
 
-/// Number of points per pass, whose activations fit the cache; chosen by hand.
-const POINTS_PER_PASS: usize = 256;
-
 impl Field {
-    /// Returns whether the box between two corners in the unit cube intersects an occupied cell.
-    pub fn has_occupied_cell(&self, low: [f32; 3], high: [f32; 3]) -> bool {
+    fn has_occupied_cell(&self, low: [f32; 3], high: [f32; 3]) -> bool {
         let [xs, ys, zs] = [0, 1, 2].map(|axis| cell_at(low)[axis]..=cell_at(high)[axis]);
         zs.into_iter().any(|z| {
             ys.clone().any(|y| {
@@ -115,35 +125,9 @@ impl Field {
         })
     }
 
-    /// Evaluates the field at points of the unit cube, in this thread.
-    pub fn sample_points(&self, points: &[[f32; 3]]) -> Vec<PointSample> {
-        let mut samples = vec![PointSample::default(); points.len()];
-        let occupied: Vec<usize> =
-            (0..points.len()).filter(|&i| self.has_occupied_cell(points[i], points[i])).collect();
-        let mut rows = DensityRows::default();
-        for indices in occupied.chunks(POINTS_PER_PASS) {
-            let n = indices.len().next_multiple_of(LANES);
-            let mut positions = vec![0.0; 3 * n];
-            for (k, &i) in indices.iter().enumerate() {
-                for axis in 0..3 {
-                    positions[axis * n + k] = points[i][axis];
-                }
-            }
-            let outputs = rows.outputs_at(self, &positions, n);
-            for (k, &i) in indices.iter().enumerate() {
-                samples[i] = PointSample {
-                    density: exp(outputs[k].min(MAX_RAW_DENSITY)),
-                    raw_colour: std::array::from_fn(|c| outputs[(RAW_COLOUR + c) * n + k]),
-                    view_features: std::array::from_fn(|f| outputs[(VIEW_FEATURE + f) * n + k]),
-                };
-            }
-        }
-        samples
-    }
-
-    /// Computes, in this thread, the view-dependent part of raw colours for composited view
-    /// features and each of `directions`, which have unit length.
-    pub fn view_colours_of(
+    /// Computes the view-dependent part of raw colours for composited view features and each of
+    /// `directions`.
+    fn view_colours_of(
         &self,
         features: &[f32; VIEW_FEATURES],
         directions: &[[f32; 3]],
@@ -199,23 +183,21 @@ mod tests {
         let t = (0..).map(|k| (k as f32 + 0.5).mul_add(step, clipped.enter));
         let positions: Vec<[f32; 3]> =
             t.take_while(|&t| t < clipped.leave).map(|t| clipped.position(t)).collect();
-        let samples = field.sample_points(&positions);
+        let samples = field.samples(&positions).unwrap();
         let (mut weights, mut transmittance) = (Vec::new(), 1.0f32);
-        for sample in &samples {
-            let transmitted = (-sample.density * step).exp();
+        for density in &samples.densities {
+            let transmitted = (-density * step).exp();
             weights.push(transmittance * (1.0 - transmitted));
             transmittance *= transmitted;
         }
         let mut features = [0.0; VIEW_FEATURES];
-        for (sample, weight) in samples.iter().zip(&weights) {
-            features.iter_mut().zip(&sample.view_features).for_each(|(sum, f)| *sum += weight * f);
+        for (row, weight) in samples.view_features.chunks(VIEW_FEATURES).zip(&weights) {
+            features.iter_mut().zip(row).for_each(|(sum, f)| *sum += weight * f);
         }
         let view_colour = field.view_colours_of(&features, &[clipped.view, [0.0, 1.0, 0.0]]);
         let colour: [f32; 3] = std::array::from_fn(|c| {
-            let weighted = samples.iter().zip(&weights);
-            weighted
-                .map(|(s, weight)| weight * sigmoid(s.raw_colour[c] + view_colour[0][c]))
-                .sum::<f32>()
+            let weighted = samples.raw_colours.iter().zip(&weights);
+            weighted.map(|(raw, weight)| weight * sigmoid(raw[c] + view_colour[0][c])).sum::<f32>()
                 + transmittance
         });
         let pixel = field.render(&[ray])[0];
@@ -223,7 +205,7 @@ mod tests {
             transmittance > 0.01 && transmittance < 0.9 && view_colour[0] != view_colour[1],
             "{transmittance} {view_colour:?}"
         );
-        assert!(samples.iter().any(|s| s.density == 0.0));
+        assert!(samples.densities.contains(&0.0));
         for c in 0..3 {
             assert!((colour[c] - pixel.colour[c]).abs() < 1e-3, "{colour:?} {pixel:?}");
         }

@@ -4,16 +4,17 @@ use numerics::CounterRng;
 use scene::Bounds;
 
 use crate::architecture::Architecture;
-use crate::chunk::{Chunk, FeatureGradients, Roulette};
+use crate::chunk::{Chunk, Roulette};
 use crate::field::Field;
-use crate::grid::{Level, LevelGradients, arrange_in_rows};
+use crate::grid::Level;
 use crate::march::{March, MarchedSamples, march};
 use crate::math::spherical_harmonics;
 use crate::mlp::Layer;
 use crate::occupancy::Cell;
+use crate::passes::Passes;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::regularisers::{Regularisers, background_likeness};
-use crate::shading::{NetworkGradients, RayGradients};
+use crate::shading::RayGradients;
 use crate::spec::Strides;
 use crate::spec::{
     BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS,
@@ -164,27 +165,13 @@ fn fused_gradients(
     upstream: RayGradients<'_>,
     roulette: Roulette,
 ) -> (Vec<f32>, Vec<f32>, usize) {
-    let mut transposed = vec![0.0; field.network.len()];
-    field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
-    let mut network = vec![0.0; field.network.len()];
-    let mut features = FeatureGradients::default();
-    chunk.backward(
-        field,
-        upstream,
-        roulette,
-        &mut NetworkGradients { transposed: &transposed, sums: &mut network },
-        &mut features,
-    );
-    arrange_in_rows(&features.positions, &mut features.rows);
-    let mut grid = vec![0.0f32; field.grid.len()];
-    for (level, gradients) in field.levels.iter().zip(&features.levels) {
-        let mut sums = LevelGradients::zeros(level);
-        for half in &mut sums.halves {
-            half.scatter(level, &features.rows, gradients);
-        }
-        sums.add_to(&mut grid[level.range()]);
-    }
-    (grid, network, features.positions.len())
+    let mut passes = Passes::new(field);
+    std::mem::swap(&mut passes.chunk, chunk);
+    passes.backward(field, upstream, roulette);
+    passes.scatter(field);
+    std::mem::swap(&mut passes.chunk, chunk);
+    let samples = passes.feature_gradients.positions.len();
+    (passes.grid_gradient(field), passes.network_gradient().to_vec(), samples)
 }
 
 pub(crate) fn example() -> (Field, Vec<Ray>) {

@@ -2,6 +2,7 @@ mod checkpoint;
 mod options;
 mod phases;
 mod shard;
+mod step;
 
 use std::ops::RangeInclusive;
 use std::slice::ChunksMut;
@@ -21,6 +22,7 @@ use numerics::simd::LANES;
 
 pub use options::{NETWORK_DECAY, RenderedBundles, Supervisor, TrainingOptions};
 pub use phases::{Phase, PhaseClock, PhaseTimes};
+pub use step::Step;
 
 use shard::{ShardResult, StepWork, Worker};
 
@@ -37,20 +39,17 @@ pub struct StepReport {
     pub skipped: bool,
 }
 
-/// Error returned when a training can't continue.
+/// Error returned when a training can't continue: two steps within 100 weren't finite.
 #[derive(Debug, thiserror::Error)]
-pub enum TrainingError {
-    /// Two steps within 100 weren't finite.
-    #[error(
-        "step {step}: {tensor} is not finite, for the second time within 100 steps; lower the \
-        learning rate"
-    )]
-    NotFinite {
-        /// Number of the step.
-        step: u64,
-        /// Description of the tensor.
-        tensor: &'static str,
-    },
+#[error(
+    "step {step}: {tensor} is not finite, for the second time within 100 steps; lower the \
+    learning rate"
+)]
+pub struct TrainingError {
+    /// Number of the step.
+    pub step: u64,
+    /// Description of the tensor.
+    pub tensor: &'static str,
 }
 
 /// Target number of rays of a shard, unless [`SHARDS`] limits their number (docs/design/047). Fewer
@@ -81,8 +80,6 @@ pub struct Trainer {
     /// Transposed weights of the networks' layers, for the backward pass.
     transposed: Aligned,
     state: TrainingState,
-    /// Mean number of samples per ray of the last step; before the first, that of a full ray.
-    samples_per_ray: f64,
     shards: Vec<ShardResult>,
     workers: Mutex<Vec<Worker>>,
     times: [PhaseTimes; Phase::ALL.len()],
@@ -112,8 +109,7 @@ impl Trainer {
             grid_gradients: field.levels.iter().map(LevelGradients::zeros).collect(),
             average: None,
             transposed: Aligned::zeros(field.network.len()),
-            state: TrainingState::default(),
-            samples_per_ray: field.architecture.samples_per_full_ray(),
+            state: TrainingState::new(field.architecture.samples_per_full_ray()),
             shards: Vec::new(),
             workers: Mutex::new(Vec::new()),
             times: Default::default(),
@@ -136,14 +132,9 @@ impl Trainer {
         &self.field
     }
 
-    /// Returns the number of steps taken.
-    pub fn steps(&self) -> u64 {
-        self.state.steps
-    }
-
-    /// Returns the number of rays cast.
-    pub fn rays_done(&self) -> u64 {
-        self.state.rays
+    /// Returns the progress of the training.
+    pub fn state(&self) -> &TrainingState {
+        &self.state
     }
 
     /// Takes a step; returns `None` after all rays have been cast.
@@ -151,41 +142,36 @@ impl Trainer {
         &mut self,
         supervisor: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TrainingError> {
-        supervisor.set_progress(self.state.progress(self.options.rays));
-        let rays_per_bundle = supervisor.rays_per_bundle();
-        let target_rays = self.options.rays_of_step(&self.state, self.samples_per_ray);
-        let bundles = self.state.bundles_of_step(self.options.rays, target_rays, rays_per_bundle);
-        let Some(bundles) = bundles else { return Ok(None) };
+        let target_rays = self.options.rays_of_step(&self.state);
+        let step = Step::next(&self.state, supervisor, self.options.rays, target_rays);
+        let Some(step) = step else { return Ok(None) };
         self.phase(Phase::Occupancy, Self::update_occupancy);
         for layer in self.field.layers.all() {
             layer.transpose(&self.field.network, &mut self.transposed);
         }
 
-        let first_bundle = self.state.bundles;
-        self.phase(Phase::Passes, |t, clock| t.run_shards(&*supervisor, bundles, clock));
+        self.phase(Phase::Passes, |t, clock| t.run_shards(&*supervisor, step, clock));
         self.phase(Phase::Sums, Self::sum_network_gradients);
         let samples: usize = self.shards.iter().map(|s| s.samples).sum();
-        let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / bundles as f64;
-        self.state.count(bundles, rays_per_bundle);
-        let rays = bundles * rays_per_bundle;
-        self.samples_per_ray = samples as f64 / rays as f64;
+        let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / step.bundles as f64;
+        self.state.count(step, samples);
         let nonfinite = self.find_nonfinite(loss);
         if let Some(tensor) = nonfinite {
             self.network_gradients.fill(0.0);
             if !self.state.record_nonfinite_step() {
-                return Err(TrainingError::NotFinite { step: self.state.steps, tensor });
+                return Err(TrainingError { step: self.state.steps, tensor });
             }
         } else {
             self.phase(Phase::GridGradients, Self::sum_grid_gradients);
             self.phase(Phase::Adam, Self::apply_gradients);
             self.phase(Phase::Average, Self::average_weights);
             self.phase(Phase::Records, |trainer, clock| {
-                trainer.record(supervisor, first_bundle, rays_per_bundle, clock);
+                trainer.record(supervisor, step, clock);
             });
         }
         self.state.steps += 1;
         let skipped = nonfinite.is_some();
-        Ok(Some(StepReport { loss, rays, samples, skipped }))
+        Ok(Some(StepReport { loss, rays: step.rays(), samples, skipped }))
     }
 
     /// Returns the time spent in each phase so far.
@@ -202,25 +188,22 @@ impl Trainer {
     }
 
     /// Runs the forward and backward pass of a step's bundles, a range of them per shard.
-    fn run_shards(&mut self, supervisor: &impl Supervisor, bundles: usize, clock: &PhaseClock) {
+    fn run_shards(&mut self, supervisor: &impl Supervisor, step: Step, clock: &PhaseClock) {
         let work = StepWork {
             field: &self.field,
             transposed: &self.transposed,
             supervisor,
             options: &self.options,
             strides: self.field.occupancy.strides(self.state.steps),
-            first_bundle: self.state.bundles,
-            first_ray: self.state.rays,
-            bundles,
+            step,
         };
         // Independent of the number of threads, so that sums have one order.
-        let shards = (bundles * supervisor.rays_per_bundle() / RAYS_PER_SHARD)
-            .clamp(*SHARDS.start(), *SHARDS.end());
+        let shards = (step.rays() / RAYS_PER_SHARD).clamp(*SHARDS.start(), *SHARDS.end());
         self.shards.resize_with(shards, ShardResult::default);
         let workers = &self.workers;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let mut worker = lock(workers).pop().unwrap_or_default();
-            let range = bundles * i / shards..bundles * (i + 1) / shards;
+            let range = step.bundles * i / shards..step.bundles * (i + 1) / shards;
             clock.task(|| shard.run(&mut worker, &work, range));
             lock(workers).push(worker);
         });
@@ -331,29 +314,12 @@ impl Trainer {
 
     /// Raises the densities recorded in the occupancy grid to those of the step's samples, and
     /// passes the rendered colours to the supervisor.
-    fn record(
-        &mut self,
-        supervisor: &mut impl Supervisor,
-        first_bundle: u64,
-        rays_per_bundle: usize,
-        clock: &PhaseClock,
-    ) {
+    fn record(&mut self, supervisor: &mut impl Supervisor, step: Step, clock: &PhaseClock) {
         let occupancy = &self.field.occupancy;
         self.shards.par_iter().for_each(|shard| {
             clock.task(|| occupancy.raise_densities(&shard.hits));
         });
-        let mut next = first_bundle;
-        let rendered: Vec<_> = self
-            .shards
-            .iter()
-            .map(|shard| {
-                let colours = &shard.colours[..];
-                let first_bundle = next;
-                next += (colours.len() / rays_per_bundle) as u64;
-                RenderedBundles { first_bundle, colours }
-            })
-            .collect();
-        supervisor.record_colours(&rendered, clock);
+        step.record_colours(supervisor, self.shards.iter().map(|shard| &shard.colours), clock);
     }
 
     /// Evaluates the density of the cells that are due, and updates the occupancy.

@@ -1,3 +1,5 @@
+use crate::trainer::Step;
+
 /// Progress of a training run, and its response to non-finite steps. Such a step is skipped and
 /// halves the learning rates; another one within 100 steps ends the run (docs/design/006).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -10,40 +12,30 @@ pub struct TrainingState {
     pub rays: u64,
     /// Factor of all learning rates, halved by each skipped step.
     pub learning_rate_scale: f64,
+    /// Mean number of samples per ray of the last step; before the first, an estimate.
+    pub samples_per_ray: f64,
     last_nonfinite_step: Option<u64>,
 }
 
 /// Minimum number of steps between two non-finite ones; otherwise the run ends (docs/design/006).
 const MIN_STEPS_BETWEEN_FAULTS: u64 = 100;
 
-impl Default for TrainingState {
-    fn default() -> Self {
-        Self { steps: 0, bundles: 0, rays: 0, learning_rate_scale: 1.0, last_nonfinite_step: None }
-    }
-}
-
 impl TrainingState {
+    /// Creates the state before the first step, whose rays have about `samples_per_ray` samples.
+    pub fn new(samples_per_ray: f64) -> Self {
+        Self::from_counters([0, 0, 0, 1f64.to_bits(), samples_per_ray.to_bits(), u64::MAX])
+    }
+
     /// Returns the fraction of `rays` that were cast.
     pub fn progress(&self, rays: u64) -> f64 {
         (self.rays as f64 / rays.max(1) as f64).min(1.0)
     }
 
-    /// Returns the number of bundles of the next step; `None` after the last step. `rays` is the
-    /// number of rays of the training run, `target_rays` that of the step.
-    pub fn bundles_of_step(
-        &self,
-        rays: u64,
-        target_rays: usize,
-        rays_per_bundle: usize,
-    ) -> Option<usize> {
-        let remaining = rays.saturating_sub(self.rays) as usize / rays_per_bundle;
-        (remaining > 0).then(|| (target_rays / rays_per_bundle).clamp(1, remaining))
-    }
-
-    /// Adds bundles to the counters.
-    pub fn count(&mut self, bundles: usize, rays_per_bundle: usize) {
-        self.bundles += bundles as u64;
-        self.rays += (bundles * rays_per_bundle) as u64;
+    /// Adds the bundles and rays of a step to the counters.
+    pub fn count(&mut self, step: Step, samples: usize) {
+        self.bundles += step.bundles as u64;
+        self.rays += step.rays() as u64;
+        self.samples_per_ray = samples as f64 / step.rays() as f64;
     }
 
     /// Records a non-finite step and halves the learning rates. Returns whether training may
@@ -58,47 +50,61 @@ impl TrainingState {
     }
 
     /// Returns the state as numbers for a checkpoint.
-    pub fn counters(&self) -> [u64; 5] {
+    pub fn counters(&self) -> [u64; 6] {
         [
             self.steps,
             self.bundles,
             self.rays,
             self.learning_rate_scale.to_bits(),
+            self.samples_per_ray.to_bits(),
             self.last_nonfinite_step.unwrap_or(u64::MAX),
         ]
     }
 
     /// Creates a state from the numbers of [`TrainingState::counters`].
-    pub fn from_counters([steps, bundles, rays, learning_rate_scale, fault]: [u64; 5]) -> Self {
+    pub fn from_counters([steps, bundles, rays, scale, samples, fault]: [u64; 6]) -> Self {
+        let [learning_rate_scale, samples_per_ray] = [scale, samples].map(f64::from_bits);
         let last_nonfinite_step = (fault != u64::MAX).then_some(fault);
-        Self {
-            steps,
-            bundles,
-            rays,
-            learning_rate_scale: f64::from_bits(learning_rate_scale),
-            last_nonfinite_step,
-        }
+        Self { steps, bundles, rays, learning_rate_scale, samples_per_ray, last_nonfinite_step }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{Ray, Supervisor};
+
+    /// Supervisor of bundles of nine rays.
+    struct Nine;
+
+    impl Supervisor for Nine {
+        fn rays_per_bundle(&self) -> usize {
+            9
+        }
+        fn sample_rays(&self, _: u64, _: &mut [Ray]) {}
+        fn loss_and_gradient(&self, _: u64, _: &[[f32; 3]], _: &mut [[f32; 3]]) -> f64 {
+            0.0
+        }
+    }
 
     #[test]
     fn a_step_has_the_target_or_the_remaining_rays() {
-        let mut state = TrainingState::default();
-        assert_eq!(state.bundles_of_step(100, 40, 9), Some(4));
-        assert_eq!(state.bundles_of_step(100, 4, 9), Some(1));
-        state.count(10, 9);
-        assert_eq!((state.bundles_of_step(100, 40, 9), state.progress(100)), (Some(1), 0.9));
-        state.count(1, 9);
-        assert_eq!(state.bundles_of_step(100, 40, 9), None);
+        let mut state = TrainingState::new(7.0);
+        let next = |state: &TrainingState, target| Step::next(state, &mut Nine, 100, target);
+        assert_eq!(next(&state, 40).unwrap().bundles, 4);
+        let small = next(&state, 4).unwrap();
+        assert_eq!(small.bundles, 1);
+        state.count(Step { bundles: 10, ..small }, 180);
+        assert_eq!((state.progress(100), state.samples_per_ray), (0.9, 2.0));
+        let last = next(&state, 40).unwrap();
+        assert_eq!((last.first_bundle, last.first_ray, last.bundles), (10, 90, 1));
+        state.count(last, 9);
+        assert!(next(&state, 40).is_none());
     }
 
     #[test]
     fn a_second_nonfinite_step_within_100_steps_ends_the_run() {
-        let mut state = TrainingState { steps: 7, ..TrainingState::default() };
+        let mut state = TrainingState { steps: 7, ..TrainingState::new(7.0) };
         assert!(state.record_nonfinite_step() && state.learning_rate_scale == 0.5);
         let restored = TrainingState::from_counters(state.counters());
         assert_eq!(restored, state);

@@ -1,4 +1,4 @@
-use radiance::{OutOfRange, check_ranges};
+use radiance::{DescriptionError, check_ranges};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -40,7 +40,7 @@ impl Default for MlpArchitecture {
 
 impl MlpArchitecture {
     /// Fails with the first number that is out of range.
-    pub fn check(&self) -> Result<(), OutOfRange> {
+    pub fn check(&self) -> Result<(), DescriptionError> {
         check_ranges(&[
             ("position_frequencies", self.position_frequencies, 0, 16),
             ("direction_frequencies", self.direction_frequencies, 0, 16),

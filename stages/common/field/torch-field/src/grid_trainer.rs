@@ -3,7 +3,8 @@ use std::path::Path;
 
 use radiance::spec::{ADAM_BETA, ADAM_EPSILON, ADAM_ROUNDED_BITS};
 use radiance::{
-    CellHit, Field, Occupancy, PhaseClock, StepReport, Supervisor, TrainingOptions, TrainingState,
+    CellHit, Field, Occupancy, PhaseClock, Step, StepReport, Supervisor, TrainingOptions,
+    TrainingState,
 };
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
@@ -11,7 +12,7 @@ use crate::error::TorchFieldError;
 use crate::grid::TorchGrid;
 use crate::ray_tensors::{columns, to_host};
 use crate::regularisers::add_regularisers;
-use crate::step::Step;
+use crate::step::{loss_of_bundles, run_in_pieces};
 
 /// Trains a [`radiance::Field`] like [`radiance::Trainer`], in libtorch: with equal random numbers,
 /// steps, learning rates and occupancy updates, but without [`TrainingOptions::roulette`], so that
@@ -27,7 +28,6 @@ pub struct GridTrainer {
     /// Moving average of the parameters, late in the training.
     average: Option<Vec<Tensor>>,
     state: TrainingState,
-    samples_per_ray: f64,
 }
 
 /// Number of positions at which the density is evaluated in one call; chosen by hand.
@@ -53,24 +53,18 @@ impl GridTrainer {
         let grid = TorchGrid::new(field, device)?;
         Ok(Self {
             occupancy: field.parts().2.clone(),
-            samples_per_ray: field.architecture.samples_per_full_ray(),
             first: zero_moments(&grid.parameters())?,
             second: zero_moments(&grid.parameters())?,
             grid,
             options,
             average: None,
-            state: TrainingState::default(),
+            state: TrainingState::new(field.architecture.samples_per_full_ray()),
         })
     }
 
-    /// Returns the number of steps taken.
-    pub fn steps(&self) -> u64 {
-        self.state.steps
-    }
-
-    /// Returns the number of rays cast.
-    pub fn rays_done(&self) -> u64 {
-        self.state.rays
+    /// Returns the progress of the training.
+    pub fn state(&self) -> &TrainingState {
+        &self.state
     }
 
     /// Returns the field, with the average of its weights if one is maintained.
@@ -94,16 +88,13 @@ impl GridTrainer {
         &mut self,
         supervisor: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
-        supervisor.set_progress(self.state.progress(self.options.rays));
-        let rays_per_bundle = supervisor.rays_per_bundle();
-        let target = self.options.rays_of_step(&self.state, self.samples_per_ray);
-        let bundles = self.state.bundles_of_step(self.options.rays, target, rays_per_bundle);
-        let Some(bundles) = bundles else { return Ok(None) };
+        let target_rays = self.options.rays_of_step(&self.state);
+        let step = Step::next(&self.state, supervisor, self.options.rays, target_rays);
+        let Some(step) = step else { return Ok(None) };
         self.update_occupancy()?;
-        let step = Step::new(&self.state, bundles, rays_per_bundle);
-        let rays = step.rays();
-        let pieces = step.run_in_pieces(|range| self.run(&*supervisor, step, range))?;
-        self.state.count(bundles, rays_per_bundle);
+        let bundles = step.bundles;
+        let pieces =
+            run_in_pieces(bundles, bundles, 1, |range| self.run(&*supervisor, step, range))?;
         let (mut samples, mut loss) = (0, 0.0);
         let (mut hits, mut colours, mut sum) = (Vec::new(), Vec::new(), Vec::new());
         for piece in pieces {
@@ -118,7 +109,7 @@ impl GridTrainer {
             }
         }
         loss /= bundles as f64;
-        self.samples_per_ray = samples as f64 / rays as f64;
+        self.state.count(step, samples);
         let skipped = !loss.is_finite() || !nets::all_finite(&sum)?;
         if skipped {
             if !self.state.record_nonfinite_step() {
@@ -127,10 +118,10 @@ impl GridTrainer {
         } else {
             no_grad(|| self.apply_gradients(&sum))?;
             self.occupancy.raise_densities(&hits);
-            step.record_colours(supervisor, &colours);
+            step.record_colours(supervisor, colours.iter(), &PhaseClock::start());
         }
         self.state.steps += 1;
-        Ok(Some(StepReport { loss, rays, samples, skipped }))
+        Ok(Some(StepReport { loss, rays: step.rays(), samples, skipped }))
     }
 
     /// Runs the forward and backward pass of a range of bundles.
@@ -140,7 +131,8 @@ impl GridTrainer {
         step: Step,
         range: Range<usize>,
     ) -> Result<GridPiece, TchError> {
-        let rays = step.sample_rays(supervisor, &range);
+        let mut rays = Vec::new();
+        step.sample_rays(supervisor, &range, &mut rays);
         let first = step.first_ray_of(&range);
         let offsets: Vec<f32> =
             (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
@@ -153,7 +145,7 @@ impl GridTrainer {
             .f_unsqueeze(-1)?
             .f_mul(&backgrounds)?
             .f_add(&forward.premultiplied)?;
-        let loss = step.loss(supervisor, &range, &colour)?;
+        let loss = loss_of_bundles(step, supervisor, &range, &colour)?;
         let surrogate = add_regularisers(
             loss.surrogate,
             &self.options.regularisers,
@@ -249,48 +241,34 @@ impl GridTrainer {
         tensors.extend(self.average.iter().flat_map(|a| numbered("average", a)));
         tensors.push((DENSITY.to_owned(), Tensor::f_from_slice(&self.occupancy.densities())?));
         tensors.push((OCCUPIED.to_owned(), Tensor::f_from_slice(&self.occupancy.to_bytes())?));
-        let mut counts = self.state.counters().map(|c| c as i64).to_vec();
-        counts.push(self.samples_per_ray.to_bits() as i64);
+        let counts = self.state.counters().map(|c| c as i64);
         tensors.push((COUNTS.to_owned(), Tensor::f_from_slice(&counts)?));
         Ok(nets::write(path, &tensors)?)
     }
 
-    /// Reads the step at which a checkpoint was written.
-    pub fn checkpoint_step(path: &Path) -> Result<u64, TorchFieldError> {
-        let [steps, ..] = read_counts(&nets::Weights::read(path)?)?;
-        Ok(steps)
-    }
-
-    /// Resumes from a checkpoint of a trainer with the same field and options.
+    /// Resumes from a checkpoint of a trainer with the same field and options. On error the trainer
+    /// may have changed.
     pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
         let weights = nets::Weights::read(path)?;
-        let [counters @ .., samples_per_ray] = read_counts(&weights)?;
-        let current = self.grid.parameters();
-        let device = self.grid.device;
-        let parameters = read_numbered(&weights, "parameter", &current, device)?;
-        let first = read_numbered(&weights, "first", &current, device)?;
-        let second = read_numbered(&weights, "second", &current, device)?;
-        let average = if weights.has("average.0") {
-            Some(read_numbered(&weights, "average", &current, device)?)
-        } else {
-            None
-        };
-        let cells = self.occupancy.densities().len() as i64;
-        let density = to_host(&weights.tensor(DENSITY, &[cells])?)?;
-        let occupied = Vec::<u8>::try_from(weights.bytes(OCCUPIED, cells)?)?;
+        let parameters = self.grid.parameters();
+        let read = |kind| read_numbered(&weights, kind, &parameters);
+        self.first = read("first")?;
+        self.second = read("second")?;
+        self.average = weights.has("average.0").then(|| read("average")).transpose()?;
+        let saved = read("parameter")?;
         no_grad(|| -> Result<(), TchError> {
-            for (mut current, saved) in current.into_iter().zip(&parameters) {
-                current.f_copy_(saved)?;
+            for (parameter, saved) in parameters.iter().zip(&saved) {
+                parameter.shallow_clone().f_copy_(saved)?;
             }
             Ok(())
         })?;
+        let cells = self.occupancy.densities().len() as i64;
+        let density = to_host(&weights.tensor(DENSITY, &[cells])?)?;
+        let occupied = Vec::<u8>::try_from(weights.bytes(OCCUPIED, cells)?)?;
         self.occupancy.restore(density, &occupied);
         self.grid.set_occupancy(&self.occupancy)?;
-        self.first = first;
-        self.second = second;
-        self.average = average;
-        self.state = TrainingState::from_counters(counters);
-        self.samples_per_ray = f64::from_bits(samples_per_ray);
+        let counts = weights.integers(COUNTS, 6)?;
+        self.state = TrainingState::from_counters(std::array::from_fn(|i| counts[i] as u64));
         Ok(())
     }
 }
@@ -306,25 +284,18 @@ fn numbered(kind: &str, tensors: &[Tensor]) -> Vec<(String, Tensor)> {
     tensors.map(|(i, t)| (format!("{kind}.{i}"), t.shallow_clone())).collect()
 }
 
-/// Reads tensors that [`numbered`] named, with the shapes of `like`.
+/// Reads tensors that [`numbered`] named, with the shapes and devices of `like`.
 fn read_numbered(
     weights: &nets::Weights,
     kind: &str,
     like: &[Tensor],
-    device: Device,
 ) -> Result<Vec<Tensor>, TorchFieldError> {
     let mut tensors = Vec::with_capacity(like.len());
     for (i, like) in like.iter().enumerate() {
         let tensor = weights.tensor(&format!("{kind}.{i}"), &like.size())?;
-        tensors.push(tensor.f_to_device(device)?);
+        tensors.push(tensor.f_to_device(like.device())?);
     }
     Ok(tensors)
-}
-
-/// Reads the training's counters.
-fn read_counts(weights: &nets::Weights) -> Result<[u64; 6], nets::WeightsError> {
-    let counts = weights.integers(COUNTS, 6)?;
-    Ok(std::array::from_fn(|i| counts[i] as u64))
 }
 
 /// Returns the zero moments of untrained parameters.
@@ -574,7 +545,7 @@ mod tests {
                     assert!(
                         error < if device == Device::Cpu { 1e-5 } else { 1e-2 },
                         "{device:?} {space:?} step {}: {report:?} {torch_report:?}",
-                        hand_written.steps()
+                        hand_written.state().steps
                     );
                     losses.push(report.loss);
                 }
@@ -621,7 +592,7 @@ mod tests {
     }
 
     fn run_until(mut trainer: GridTrainer, steps: u64) -> GridTrainer {
-        while trainer.steps() < steps
+        while trainer.state().steps < steps
             && trainer.step(&mut MeanColours { reds: Vec::new() }).unwrap().is_some()
         {}
         trainer
@@ -635,9 +606,9 @@ mod tests {
         let path = folder.path().join("checkpoint.safetensors");
         for step in [3, 33] {
             run_until(new(), step).write_checkpoint(&path).unwrap();
-            assert_eq!(GridTrainer::checkpoint_step(&path).unwrap(), step);
             let mut resumed = new();
             resumed.resume(&path).unwrap();
+            assert_eq!(resumed.state().steps, step);
             let (uninterrupted, continued) =
                 (run_until(new(), 36).field().unwrap(), run_until(resumed, 36).field().unwrap());
             assert!(
@@ -647,6 +618,6 @@ mod tests {
             );
         }
         std::fs::write(&path, b"cut short").unwrap();
-        assert!(new().resume(&path).is_err() && GridTrainer::checkpoint_step(&path).is_err());
+        assert!(new().resume(&path).is_err());
     }
 }

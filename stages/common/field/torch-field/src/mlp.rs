@@ -197,8 +197,9 @@ impl Mlp {
         all
     }
 
-    /// Averages every parameter with that of another field of the same architecture, in place.
-    pub fn average_with(&self, other: &Self) -> Result<(), TorchFieldError> {
+    /// Averages every parameter with that of a file of a field of the same architecture, in place.
+    pub fn average_with(&self, path: &Path) -> Result<(), TorchFieldError> {
+        let other = Self::read(path, self.architecture, self.bounds, self.device)?;
         no_grad(|| {
             for (mut own, other) in self.parameters().zip(other.parameters()) {
                 own.f_copy_(&own.f_add(&other)?.f_mul_scalar(0.5)?)?;
@@ -505,9 +506,13 @@ mod tests {
     fn fields_are_averaged() {
         let architecture =
             MlpArchitecture { layers: 5, hidden_dim: 16, ..MlpArchitecture::default() };
-        let [a, b, mean] = [3, 4, 3]
-            .map(|seed| Mlp::new(architecture, Bounds::default(), seed, Device::Cpu).unwrap());
-        mean.average_with(&b).unwrap();
+        let [a, b, mean] = [3, 4, 3].map(|seed| {
+            Mlp::new(architecture, Bounds::cube(1.0, 2.0, 6.0), seed, Device::Cpu).unwrap()
+        });
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("field.safetensors");
+        b.write(&path).unwrap();
+        mean.average_with(&path).unwrap();
         for ((mean, a), b) in mean.parameters().zip(a.parameters()).zip(b.parameters()) {
             let (mean, a, b) =
                 (to_host(&mean).unwrap(), to_host(&a).unwrap(), to_host(&b).unwrap());

@@ -2,14 +2,14 @@ use std::ops::Range;
 use std::path::Path;
 
 use nets::Adam;
-use radiance::{StepReport, Supervisor, TrainingState};
+use radiance::{PhaseClock, Step, StepReport, Supervisor, TrainingState};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::architecture::MlpArchitecture;
 use crate::error::TorchFieldError;
 use crate::mlp::{Batch, Mlp, SampleDraws};
-use crate::step::{Step, learning_rate};
+use crate::step::{learning_rate, loss_of_bundles, run_in_pieces};
 
 /// Options for training an [`Mlp`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -126,7 +126,7 @@ impl MlpTrainer {
     /// Creates a trainer of `field`.
     pub fn new(field: Mlp, options: MlpTraining) -> Result<Self, TorchFieldError> {
         let adam = Adam::new(field.parameters())?;
-        Ok(Self { field, options, adam, state: TrainingState::default(), stuck_steps: 0 })
+        Ok(Self { field, options, adam, state: TrainingState::new(0.0), stuck_steps: 0 })
     }
 
     /// Returns the field in its current state.
@@ -134,14 +134,9 @@ impl MlpTrainer {
         &self.field
     }
 
-    /// Returns the number of steps taken.
-    pub fn steps(&self) -> u64 {
-        self.state.steps
-    }
-
-    /// Returns the number of rays cast.
-    pub fn rays_done(&self) -> u64 {
-        self.state.rays
+    /// Returns the progress of the training.
+    pub fn state(&self) -> &TrainingState {
+        &self.state
     }
 
     /// Takes one step; returns `None` after all rays are used.
@@ -149,22 +144,17 @@ impl MlpTrainer {
         &mut self,
         supervisor: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
-        let done = self.state.progress(self.options.rays);
-        supervisor.set_progress(done);
-        let rays_per_bundle = supervisor.rays_per_bundle();
-        let Some(bundles) = self.state.bundles_of_step(
-            self.options.rays,
-            self.options.max_rays_per_step,
-            rays_per_bundle,
-        ) else {
-            return Ok(None);
-        };
-        let step = Step::new(&self.state, bundles, rays_per_bundle);
-        let rays = step.rays();
+        let MlpTraining { rays, max_rays_per_step, .. } = self.options;
+        let done = self.state.progress(rays);
+        let step = Step::next(&self.state, supervisor, rays, max_rays_per_step);
+        let Some(step) = step else { return Ok(None) };
         let pieces = self.run_step(&*supervisor, step)?;
-        self.state.count(bundles, rays_per_bundle);
+        let rays = step.rays();
+        let MlpArchitecture { coarse_samples, fine_samples, .. } = self.field.architecture;
+        let samples = rays * (2 * coarse_samples + fine_samples) as usize;
+        self.state.count(step, samples);
         let sum = sum_in_order(pieces.into_iter().map(Ok))?.expect("a step has a bundle");
-        let loss = sum.loss / bundles as f64;
+        let loss = sum.loss / step.bundles as f64;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum.gradients)?;
         if skipped {
             if !self.state.record_nonfinite_step() {
@@ -172,12 +162,10 @@ impl MlpTrainer {
             }
         } else {
             self.apply_gradients(&sum.gradients, done)?;
-            step.record_colours(supervisor, &[sum.colours]);
+            step.record_colours(supervisor, [sum.colours].iter(), &PhaseClock::start());
         }
         self.state.steps += 1;
         self.check_collapse(sum.weights, rays)?;
-        let MlpArchitecture { coarse_samples, fine_samples, .. } = self.field.architecture;
-        let samples = rays * (2 * coarse_samples + fine_samples) as usize;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
     }
 
@@ -215,7 +203,8 @@ impl MlpTrainer {
             noise_std: self.options.density_noise_std,
         };
         if self.field.device != Device::Cpu {
-            return step.run_in_pieces(|range| context.run(&self.field, supervisor, range));
+            let run = |range| context.run(&self.field, supervisor, range);
+            return run_in_pieces(step.bundles, step.bundles, 1, run);
         }
         let (bundles, count) = (step.bundles, shard_count(step.rays()));
         let shards: Vec<(Mlp, Range<usize>)> = (0..count)
@@ -242,23 +231,13 @@ impl MlpTrainer {
 
     /// Writes a checkpoint, from which training resumes. The caller makes the write atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
-        let [steps, bundles, rays, scale, fault] = self.state.counters();
-        Ok(self.adam.write_checkpoint(
-            path,
-            self.field.named_parameters(),
-            &[steps, bundles, rays, scale, fault, self.stuck_steps],
-        )?)
-    }
-
-    /// Reads the step at which a checkpoint was written.
-    pub fn checkpoint_step(path: &Path) -> Result<u64, TorchFieldError> {
-        let [steps, ..] = Adam::counts_of_checkpoint::<6>(path)?;
-        Ok(steps)
+        let counters = [&self.state.counters()[..], &[self.stuck_steps]].concat();
+        Ok(self.adam.write_checkpoint(path, self.field.named_parameters(), &counters)?)
     }
 
     /// Resumes from a checkpoint of a trainer with the same field and options.
     pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
-        let (adam, [counters @ .., stuck_steps]): (Adam, [u64; 6]) =
+        let (adam, [counters @ .., stuck_steps]): (Adam, [u64; 7]) =
             Adam::resume(path, &self.field.named_parameters())?;
         self.adam = adam;
         self.state = TrainingState::from_counters(counters);
@@ -315,7 +294,8 @@ impl StepContext {
         supervisor: &impl Supervisor,
         range: Range<usize>,
     ) -> Result<MlpPiece, TchError> {
-        let rays = self.step.sample_rays(supervisor, &range);
+        let mut rays = Vec::new();
+        self.step.sample_rays(supervisor, &range, &mut rays);
         let draws = SampleDraws::new(
             field,
             self.seed,
@@ -324,8 +304,8 @@ impl StepContext {
             self.noise_std,
         )?;
         let forward = field.forward(&Batch::new(&rays, field)?, Some(&draws))?;
-        let coarse = self.step.loss(supervisor, &range, &forward.coarse.colour)?;
-        let fine = self.step.loss(supervisor, &range, &forward.fine.colour)?;
+        let coarse = loss_of_bundles(self.step, supervisor, &range, &forward.coarse.colour)?;
+        let fine = loss_of_bundles(self.step, supervisor, &range, &forward.fine.colour)?;
         let parameters: Vec<Tensor> = field.parameters().collect();
         let gradients = Tensor::f_run_backward(
             &[coarse.surrogate.f_add(&fine.surrogate)?],

@@ -15,7 +15,7 @@ pub(crate) struct RayTensors {
     pub(crate) leave: Tensor,
     /// Coefficients of the map from t to distance (n × 1 each): start, scale, then perspective and
     /// end or, in a contraction, radii, which positions need, too, and 0.
-    distance: [Tensor; 4],
+    distance: Vec<Tensor>,
     is_contracted: bool,
 }
 
@@ -29,12 +29,7 @@ impl RayTensors {
             view: columns(&rays, device, view_direction)?,
             enter: columns(&rays, device, |r| [r.enter])?,
             leave: columns(&rays, device, |r| [r.leave.max(r.enter)])?,
-            distance: [
-                columns(&rays, device, |r| [distance_map(r)[0]])?,
-                columns(&rays, device, |r| [distance_map(r)[1]])?,
-                columns(&rays, device, |r| [distance_map(r)[2]])?,
-                columns(&rays, device, |r| [distance_map(r)[3]])?,
-            ],
+            distance: columns(&rays, device, distance_map)?.f_split(1, 1)?,
             is_contracted: bounds.space == Space::Contraction,
         })
     }
@@ -59,11 +54,11 @@ impl RayTensors {
 
     /// Returns distances in scene units at t (n × m).
     pub(crate) fn distances(&self, t: &Tensor) -> Result<Tensor, TchError> {
-        let [start, scale, perspective, end] = &self.distance;
+        let [start, scale] = [&self.distance[0], &self.distance[1]];
         if self.is_contracted {
             return sinh4(t)?.f_mul(scale)?.f_add(start);
         }
-        let divisor = self.leave.f_sub(t)?.f_mul(perspective)?.f_add(end)?;
+        let divisor = self.leave.f_sub(t)?.f_mul(&self.distance[2])?.f_add(&self.distance[3])?;
         t.f_mul(scale)?.f_div(&divisor)?.f_add(start)
     }
 

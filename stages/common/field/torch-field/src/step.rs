@@ -1,10 +1,10 @@
 use std::ops::Range;
 
-use radiance::{PhaseClock, Ray, RenderedBundles, Supervisor, TrainingState};
+use radiance::{Step, Supervisor};
 use tch::{TchError, Tensor};
 
 use crate::error::TorchFieldError;
-use crate::ray_tensors::to_host;
+use crate::ray_tensors::{matrix, to_host};
 
 /// Number of final epochs during which the learning rate decays.
 const FALLING_EPOCHS: u64 = 10;
@@ -21,15 +21,6 @@ pub(crate) fn learning_rate(highest: f64, decay: f64, epochs: u64, done: f64) ->
     highest * decay.powf(progress)
 }
 
-/// One training step of `bundles` bundles of rays. Bundles are numbered through the training.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Step {
-    first_bundle: u64,
-    first_ray: u64,
-    pub(crate) bundles: usize,
-    pub(crate) rays_per_bundle: usize,
-}
-
 /// Loss of some of a step's bundles.
 pub(crate) struct StepLoss {
     /// Sum of the bundles' losses.
@@ -40,80 +31,29 @@ pub(crate) struct StepLoss {
     pub(crate) surrogate: Tensor,
 }
 
-impl Step {
-    /// Creates the step that follows those counted in `state`.
-    pub(crate) fn new(state: &TrainingState, bundles: usize, rays_per_bundle: usize) -> Self {
-        Self { first_bundle: state.bundles, first_ray: state.rays, bundles, rays_per_bundle }
-    }
-
-    /// Returns the number of rays of the step.
-    pub(crate) fn rays(self) -> usize {
-        self.bundles * self.rays_per_bundle
-    }
-
-    /// Returns the index, over the training run, of the first ray of a range of the step's bundles.
-    pub(crate) fn first_ray_of(self, range: &Range<usize>) -> u64 {
-        self.first_ray + (range.start * self.rays_per_bundle) as u64
-    }
-
-    /// Samples the rays of a range of the step's bundles.
-    pub(crate) fn sample_rays(
-        self,
-        supervisor: &impl Supervisor,
-        range: &Range<usize>,
-    ) -> Vec<Ray> {
-        let mut rays = vec![Ray::default(); range.len() * self.rays_per_bundle];
-        for (i, rays) in rays.chunks_exact_mut(self.rays_per_bundle).enumerate() {
-            supervisor.sample_rays(self.first_bundle + (range.start + i) as u64, rays);
-        }
-        rays
-    }
-
-    /// Computes the loss of the colours (n × 3) of a range of the step's bundles.
-    pub(crate) fn loss(
-        self,
-        supervisor: &impl Supervisor,
-        range: &Range<usize>,
-        colour: &Tensor,
-    ) -> Result<StepLoss, TchError> {
-        let colours = to_host(colour)?.as_chunks::<3>().0.to_vec();
-        let mut gradients = vec![[0.0f32; 3]; colours.len()];
-        let chunks = gradients.chunks_exact_mut(self.rays_per_bundle).enumerate();
-        let sum = chunks
-            .map(|(i, gradients)| {
-                let colours = &colours[i * self.rays_per_bundle..][..self.rays_per_bundle];
-                let bundle = self.first_bundle + (range.start + i) as u64;
-                supervisor.loss_and_gradient(bundle, colours, gradients)
-            })
-            .sum();
-        let scaled: Vec<f32> =
-            gradients.as_flattened().iter().map(|g| g / self.bundles as f32).collect();
-        let gradients = Tensor::f_from_slice(&scaled)?
-            .f_reshape([colours.len() as i64, 3])?
-            .f_to_device(colour.device())?;
-        let surrogate = colour.f_mul(&gradients)?.f_sum(None::<tch::Kind>)?;
-        Ok(StepLoss { sum, colours, surrogate })
-    }
-
-    /// Passes the rendered colours of all pieces, in order, to the supervisor.
-    pub(crate) fn record_colours(self, supervisor: &mut impl Supervisor, pieces: &[Vec<[f32; 3]>]) {
-        let mut first_bundle = self.first_bundle;
-        let mut rendered = Vec::with_capacity(pieces.len());
-        for colours in pieces {
-            rendered.push(RenderedBundles { first_bundle, colours });
-            first_bundle += (colours.len() / self.rays_per_bundle) as u64;
-        }
-        // Nobody reads this clock.
-        supervisor.record_colours(&rendered, &PhaseClock::start());
-    }
-
-    /// Runs the step's bundles in pieces, whose size is halved after running out of memory.
-    pub(crate) fn run_in_pieces<T>(
-        self,
-        run: impl FnMut(Range<usize>) -> Result<T, TchError>,
-    ) -> Result<Vec<T>, TorchFieldError> {
-        run_in_pieces(self.bundles, self.bundles, 1, run)
-    }
+/// Computes the loss of the colours (n × 3) of a range of a step's bundles.
+pub(crate) fn loss_of_bundles(
+    step: Step,
+    supervisor: &impl Supervisor,
+    range: &Range<usize>,
+    colour: &Tensor,
+) -> Result<StepLoss, TchError> {
+    let colours = to_host(colour)?.as_chunks::<3>().0.to_vec();
+    let mut gradients = vec![[0.0f32; 3]; colours.len()];
+    let bundles = colours
+        .chunks_exact(step.rays_per_bundle)
+        .zip(gradients.chunks_exact_mut(step.rays_per_bundle));
+    let sum = (step.first_bundle_of(range)..)
+        .zip(bundles)
+        .map(|(bundle, (colours, gradients))| {
+            supervisor.loss_and_gradient(bundle, colours, gradients)
+        })
+        .sum();
+    let scaled: Vec<f32> =
+        gradients.as_flattened().iter().map(|g| g / step.bundles as f32).collect();
+    let gradients = matrix(&scaled, [colours.len() as i64, 3], colour.device())?;
+    let surrogate = colour.f_mul(&gradients)?.f_sum(None::<tch::Kind>)?;
+    Ok(StepLoss { sum, colours, surrogate })
 }
 
 /// Runs `0..count` in pieces of `size`; after running out of memory, in pieces of half that size,
@@ -158,13 +98,12 @@ mod tests {
     /// With memory for three bundles, each bundle is processed exactly once.
     #[test]
     fn pieces_get_smaller_until_they_fit() {
-        let step = Step::new(&TrainingState::default(), 17, 4);
-        let pieces = step.run_in_pieces(run_at_most_three).unwrap();
+        let pieces = run_in_pieces(17, 17, 1, run_at_most_three).unwrap();
         assert!(pieces.iter().all(|p| p.len() <= 3) && pieces.len() < 10);
         assert_eq!(pieces.into_iter().flatten().collect::<Vec<_>>(), (0..17).collect::<Vec<_>>());
         let always_fails =
             |_| -> Result<(), _> { Err(TchError::Torch("CUDA out of memory".to_owned())) };
-        assert!(step.run_in_pieces(always_fails).is_err());
+        assert!(run_in_pieces(17, 17, 1, always_fails).is_err());
     }
 
     /// Expected rates are from the reference implementation's log of 20 epochs.

@@ -97,11 +97,6 @@ impl Adam {
         });
         Ok((adam, counts))
     }
-
-    /// Reads the training's counters from a checkpoint.
-    pub fn counts_of_checkpoint<const N: usize>(path: &Path) -> Result<[u64; N], WeightsError> {
-        Ok(read_counts(&Weights::read(path)?)?.0)
-    }
 }
 
 /// Name of the tensor of counters; the optimiser's steps are last.

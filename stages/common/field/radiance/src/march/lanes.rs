@@ -34,6 +34,7 @@ pub(super) trait RayKind {
 const LOG2_SIDE_MASK: u32 = 0b111;
 
 /// The rays of all lanes.
+#[derive(Default)]
 pub(super) struct LaneRays {
     /// Origins, one array per axis.
     pub(super) origin: [[f32; LANES]; 3],
@@ -124,20 +125,6 @@ fn append_slots<K: RayKind>(rays: &[NormalizedRay], active: &[u32], samples: &mu
 
 impl LaneRays {
     #[inline(always)]
-    fn new() -> Self {
-        let (row, rows) = ([0.0; LANES], [[0.0; LANES]; 3]);
-        Self {
-            origin: rows,
-            direction: rows,
-            inverse: rows,
-            radii: row,
-            offset: row,
-            enter: row,
-            leave: row,
-        }
-    }
-
-    #[inline(always)]
     fn set(&mut self, lane: usize, ray: &NormalizedRay, inverse: [f32; 3], offset: f32) {
         for axis in 0..3 {
             self.origin[axis][lane] = ray.origin[axis];
@@ -159,7 +146,7 @@ impl<'a> Marching<'a> {
             next_active: 0,
             busy_lanes: 0,
             active_index: [0; LANES],
-            rays: LaneRays::new(),
+            rays: LaneRays::default(),
             occupied_until: [0.0; LANES],
             k: [0; LANES],
         }

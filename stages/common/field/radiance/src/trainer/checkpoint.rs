@@ -1,71 +1,58 @@
 use std::path::Path;
 
-use safetensors::SafeTensors;
+use safetensors::{Dtype, SafeTensors};
 
 use super::{ParameterBuffers, Trainer};
 use crate::field::Field;
 use crate::occupancy::CELLS;
-use crate::tensors::{
-    FieldError, FieldProblem, Tensor, read_f32, read_tensors, read_u8, read_u32, write_tensors,
-};
+use crate::tensors::{FieldError, floats, read_tensor, read_tensors, write_tensors};
 use crate::training_state::TrainingState;
 
 impl Trainer {
     /// Writes a checkpoint from which a resumed training ends in the same bytes. Not atomic: the
     /// caller renames the file.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), FieldError> {
-        let counters = self.state.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
-        let counters: Vec<u8> = counters.flat_map(u64::to_le_bytes).collect();
+        let counters = self.state.counters();
         let occupied = self.field.occupancy.to_bytes();
         let density = self.field.occupancy.densities();
-        let average = self.average.iter();
-        let average = average.flat_map(|a| {
-            [
-                ("average.grid", Tensor::of_floats(&a.grid)),
-                ("average.network", Tensor::of_floats(&a.network)),
-            ]
-        });
-        let tensors: Vec<_> = average
-            .chain([
-                ("counters", Tensor::of_bytes(&counters)),
-                ("density", Tensor::of_floats(&density)),
-                ("grid", Tensor::of_floats(&self.field.grid)),
-                ("moments.grid", Tensor::of_integers(&self.moments.grid)),
-                ("moments.network", Tensor::of_integers(&self.moments.network)),
-                ("network", Tensor::of_floats(&self.field.network)),
-                ("occupied", Tensor::of_bytes(&occupied)),
-            ])
-            .collect();
+        let mut tensors = vec![
+            ("counters", Dtype::U64, bytemuck::cast_slice(&counters)),
+            floats("density", &density),
+            floats("grid", &self.field.grid),
+            ("moments.grid", Dtype::U32, bytemuck::cast_slice::<u32, u8>(&self.moments.grid)),
+            ("moments.network", Dtype::U32, bytemuck::cast_slice::<u32, u8>(&self.moments.network)),
+            floats("network", &self.field.network),
+            ("occupied", Dtype::U8, &occupied),
+        ];
+        if let Some(average) = &self.average {
+            tensors.push(floats("average.grid", &average.grid));
+            tensors.push(floats("average.network", &average.network));
+        }
         write_tensors(path, &tensors)
-    }
-
-    /// Returns the step at which a checkpoint was written.
-    pub fn checkpoint_step(path: &Path) -> Result<u64, FieldError> {
-        read_tensors(path, |tensors| Ok(read_counters(tensors)?[0]))
     }
 
     /// Resumes from a checkpoint of a trainer with the same field and options. On error the trainer
     /// is unchanged.
     pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
         read_tensors(path, |tensors| {
-            let [state @ .., samples_per_ray] = read_counters(tensors)?;
+            let mut counters = [0; 6];
+            read_tensor(tensors, "counters", Dtype::U64, &mut counters)?;
             let field = &mut self.field;
             let mut moments = ParameterBuffers::zeros(field);
-            read_u32(tensors, "moments.grid", &mut moments.grid)?;
-            read_u32(tensors, "moments.network", &mut moments.network)?;
+            read_tensor(tensors, "moments.grid", Dtype::U32, &mut moments.grid)?;
+            read_tensor(tensors, "moments.network", Dtype::U32, &mut moments.network)?;
             let weights = read_parameters(tensors, "", field)?;
             let is_averaged = tensors.names().contains(&"average.grid");
             let average =
                 is_averaged.then(|| read_parameters(tensors, "average.", field)).transpose()?;
-            let mut density = vec![0.0; CELLS];
-            read_f32(tensors, "density", &mut density)?;
-            let occupied = read_u8(tensors, "occupied", CELLS)?;
+            let (mut density, mut occupied) = (vec![0.0; CELLS], vec![0; CELLS]);
+            read_tensor(tensors, "density", Dtype::F32, &mut density)?;
+            read_tensor(tensors, "occupied", Dtype::U8, &mut occupied)?;
             // Nothing fails from here on.
             (self.moments, self.average) = (moments, average);
             (field.grid, field.network) = (weights.grid, weights.network);
             field.occupancy.restore(density, &occupied);
-            self.state = TrainingState::from_counters(state);
-            self.samples_per_ray = f64::from_bits(samples_per_ray);
+            self.state = TrainingState::from_counters(counters);
             Ok(())
         })
     }
@@ -76,15 +63,9 @@ fn read_parameters(
     tensors: &SafeTensors<'_>,
     prefix: &str,
     field: &Field,
-) -> Result<ParameterBuffers, FieldProblem> {
+) -> Result<ParameterBuffers, String> {
     let mut parameters = ParameterBuffers::zeros(field);
-    read_f32(tensors, &format!("{prefix}grid"), &mut parameters.grid)?;
-    read_f32(tensors, &format!("{prefix}network"), &mut parameters.network)?;
+    read_tensor(tensors, &format!("{prefix}grid"), Dtype::F32, &mut parameters.grid)?;
+    read_tensor(tensors, &format!("{prefix}network"), Dtype::F32, &mut parameters.network)?;
     Ok(parameters)
-}
-
-/// Reads a checkpoint's six counters.
-fn read_counters(tensors: &SafeTensors<'_>) -> Result<[u64; 6], FieldProblem> {
-    let bytes = read_u8(tensors, "counters", 48)?;
-    Ok(std::array::from_fn(|i| u64::from_le_bytes(bytes.as_chunks::<8>().0[i])))
 }

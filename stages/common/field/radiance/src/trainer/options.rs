@@ -55,12 +55,11 @@ pub struct TrainingOptions {
 }
 
 impl TrainingOptions {
-    /// Returns the target number of rays of a step, given the last step's mean number of samples
-    /// per ray.
-    pub fn rays_of_step(&self, state: &TrainingState, samples_per_ray: f64) -> usize {
+    /// Returns the target number of rays of a step.
+    pub fn rays_of_step(&self, state: &TrainingState) -> usize {
         let growth = libm::pow(STEP_GROWTH, state.progress(self.rays));
         // Rays may have no samples; the limit is chosen by hand.
-        let rays = self.samples_per_step as f64 * growth / samples_per_ray.max(0.1);
+        let rays = self.samples_per_step as f64 * growth / state.samples_per_ray.max(0.1);
         (rays as usize).clamp(MIN_RAYS_PER_STEP, self.max_rays_per_step.max(MIN_RAYS_PER_STEP))
     }
 

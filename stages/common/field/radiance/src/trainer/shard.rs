@@ -1,6 +1,7 @@
 use std::ops::Range;
 
 use super::options::{Supervisor, TrainingOptions};
+use super::step::Step;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
 use crate::field::Field;
 use crate::grid::arrange_in_rows;
@@ -17,10 +18,7 @@ pub(super) struct StepWork<'a, S> {
     pub(super) supervisor: &'a S,
     pub(super) options: &'a TrainingOptions,
     pub(super) strides: Strides,
-    pub(super) first_bundle: u64,
-    pub(super) first_ray: u64,
-    /// Number of bundles of the step.
-    pub(super) bundles: usize,
+    pub(super) step: Step,
 }
 
 /// Result of a shard; buffers are reused.
@@ -62,7 +60,7 @@ impl ShardResult {
         self.network_gradients.resize(work.field.network.len(), 0.0);
         self.network_gradients.fill(0.0);
         (self.loss, self.samples) = (0.0, 0);
-        let chunk_bundles = (CHUNK_RAYS / work.supervisor.rays_per_bundle()).max(1);
+        let chunk_bundles = (CHUNK_RAYS / work.step.rays_per_bundle).max(1);
         let mut next = range.start;
         while next < range.end {
             let bundles = next..(next + chunk_bundles).min(range.end);
@@ -81,37 +79,35 @@ impl ShardResult {
         work: &StepWork<'_, impl Supervisor>,
         bundles: Range<usize>,
     ) {
-        let StepWork { field, supervisor, options, .. } = *work;
-        let rays_per_bundle = supervisor.rays_per_bundle();
+        let StepWork { field, supervisor, options, step, .. } = *work;
+        let rays_per_bundle = step.rays_per_bundle;
         let ray_count = bundles.len() * rays_per_bundle;
-        worker.rays.resize(ray_count, Ray::default());
         worker.colours.resize(ray_count, [0.0; 3]);
         worker.gradients.resize(ray_count, [0.0; 3]);
-        let first_bundle = work.first_bundle + bundles.start as u64;
-        for (i, rays) in worker.rays.chunks_exact_mut(rays_per_bundle).enumerate() {
-            supervisor.sample_rays(first_bundle + i as u64, rays);
-        }
+        step.sample_rays(supervisor, &bundles, &mut worker.rays);
         worker.clipped.clear();
         worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
         worker.backgrounds.clear();
         worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
-        let first_ray = work.first_ray + (bundles.start * rays_per_bundle) as u64;
+        let first_ray = step.first_ray_of(&bundles);
         worker.offsets.clear();
         worker.offsets.extend((0..ray_count as u64).map(|r| options.offset(first_ray + r)));
         worker.chunk.forward(field, &worker.clipped, &worker.offsets, work.strides);
-        self.samples += worker.chunk.samples();
-        worker.chunk.list_hits(field.march_step(), &mut self.hits);
+        let Chunk { samples, counted, .. } = &worker.chunk;
+        self.samples += samples.count;
+        samples.list_hits(counted, field.march_step(), &mut self.hits);
         for (r, sum) in worker.chunk.sums.iter().enumerate() {
             let background = worker.backgrounds[r];
             worker.colours[r] =
                 std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
         }
+        let first_bundle = step.first_bundle_of(&bundles);
         for (i, colours) in worker.colours.chunks_exact(rays_per_bundle).enumerate() {
             let gradients = &mut worker.gradients[i * rays_per_bundle..][..rays_per_bundle];
             self.loss += supervisor.loss_and_gradient(first_bundle + i as u64, colours, gradients);
         }
         self.colours.extend_from_slice(&worker.colours);
-        let scale = 1.0 / work.bundles as f32;
+        let scale = 1.0 / step.bundles as f32;
         for gradient in worker.gradients.iter_mut().flatten() {
             *gradient *= scale;
         }
