@@ -4,41 +4,33 @@ use std::ffi::{OsStr, OsString};
 use std::os::unix::ffi::{OsStrExt as _, OsStringExt as _};
 use std::path::Path;
 
-use crate::resources::Resources;
 use crate::site::Site;
+use crate::submission::{Submission, Task};
 
 /// Maximum length of a job's name in characters, so that `squeue`'s table stays readable; chosen by
 /// hand.
 const MAX_NAME_CHARS: usize = 100;
 
-/// One job to submit.
-pub(crate) struct JobRequest<'a> {
-    pub(crate) name: &'a str,
-    pub(crate) resources: &'a Resources,
-    pub(crate) site: &'a Site,
-    /// Jobs that must succeed first.
-    pub(crate) after: &'a [&'a str],
-    /// Working directory.
-    pub(crate) working_folder: &'a Path,
-    pub(crate) log: &'a Path,
-    pub(crate) script: &'a Path,
-    /// Index of the task, passed to the script.
-    pub(crate) number: usize,
-}
-
-impl JobRequest<'_> {
-    /// Returns the arguments of `sbatch`. The site's own come last, so that they win.
-    pub(crate) fn arguments(&self) -> Vec<OsString> {
-        let Self { resources, site, .. } = self;
-        let printable = self.name.chars().map(|c| if c.is_control() { ' ' } else { c });
+impl Submission {
+    /// Returns the arguments of `sbatch` for a task's job. `after` are the IDs of jobs that must
+    /// succeed first. The site's own arguments come last, so that they win.
+    pub(crate) fn arguments(
+        &self,
+        number: usize,
+        site: &Site,
+        after: &[&str],
+        working_folder: &Path,
+    ) -> Vec<OsString> {
+        let Task { label, resources, .. } = &self.tasks[number];
+        let printable = label.chars().map(|c| if c.is_control() { ' ' } else { c });
         let name: String = printable.take(MAX_NAME_CHARS).collect();
         let mut arguments: Vec<OsString> =
             ["--parsable", "--nodes=1", "--ntasks=1", "--requeue", "--open-mode=append"]
                 .map(OsString::from)
                 .into();
         arguments.push(option("--job-name", name));
-        arguments.push(option("--chdir", self.working_folder));
-        arguments.push(option("--output", escape_patterns(self.log)));
+        arguments.push(option("--chdir", working_folder));
+        arguments.push(option("--output", escape_patterns(&self.log_path(number))));
         arguments.push(option("--signal", format!("B:USR1@{}", site.notice.seconds)));
         let optional = [
             ("--cpus-per-task", resources.cpus.map(|n| n.to_string())),
@@ -52,13 +44,13 @@ impl JobRequest<'_> {
         for (name, value) in optional {
             arguments.extend(value.map(|value| option(name, value)));
         }
-        if !self.after.is_empty() {
-            arguments.push(option("--dependency", format!("afterok:{}", self.after.join(":"))));
+        if !after.is_empty() {
+            arguments.push(option("--dependency", format!("afterok:{}", after.join(":"))));
             arguments.push("--kill-on-invalid-dep=yes".into());
         }
         arguments.extend(site.arguments.iter().map(OsString::from));
-        arguments.push(self.script.into());
-        arguments.push(self.number.to_string().into());
+        arguments.push(self.script_path().into());
+        arguments.push(number.to_string().into());
         arguments
     }
 }
@@ -73,14 +65,8 @@ fn option(name: &str, value: impl AsRef<OsStr>) -> OsString {
 
 /// Doubles each `%` of a log's path, which Slurm would read as a filename pattern.
 fn escape_patterns(path: &Path) -> OsString {
-    let mut escaped = Vec::new();
-    for &byte in path.as_os_str().as_bytes() {
-        escaped.push(byte);
-        if byte == b'%' {
-            escaped.push(byte);
-        }
-    }
-    OsString::from_vec(escaped)
+    let parts: Vec<&[u8]> = path.as_os_str().as_bytes().split(|&byte| byte == b'%').collect();
+    OsString::from_vec(parts.join(&b"%%"[..]))
 }
 
 #[cfg(test)]
@@ -88,25 +74,23 @@ mod tests {
     use super::*;
 
     fn joined_arguments(resources: &str, site: &str, after: &[&str]) -> String {
-        let resources: Resources = serde_yaml::from_str(resources).unwrap();
-        let site: Site = serde_yaml::from_str(site).unwrap();
-        let job = JobRequest {
-            name: "train-ss [supersample=2]",
-            resources: &resources,
-            site: &site,
-            after,
-            working_folder: Path::new("/work"),
-            log: Path::new("/s/50%/7.log"),
-            script: Path::new("/s/job.sh"),
-            number: 7,
+        let task = Task {
+            label: "train-ss [supersample=2]".to_owned(),
+            resources: serde_yaml::from_str(resources).unwrap(),
+            ..Task::default()
         };
-        let arguments: Vec<String> =
-            job.arguments().into_iter().map(|argument| argument.into_string().unwrap()).collect();
+        let site: Site = serde_yaml::from_str(site).unwrap();
+        let submission = Submission::new(Path::new("/s/50%"), "a", vec![Task::default(), task]);
+        let arguments: Vec<String> = submission
+            .arguments(1, &site, after, Path::new("/work"))
+            .into_iter()
+            .map(|argument| argument.into_string().unwrap())
+            .collect();
         arguments.join("|")
     }
 
     const COMMON: &str = "--parsable|--nodes=1|--ntasks=1|--requeue|--open-mode=append|\
-        --job-name=train-ss [supersample=2]|--chdir=/work|--output=/s/50%%/7.log|\
+        --job-name=train-ss [supersample=2]|--chdir=/work|--output=/s/50%%/slurm/a/1.log|\
         --signal=B:USR1@90";
 
     #[test]
@@ -131,7 +115,7 @@ mod tests {
         ] {
             assert_eq!(
                 joined_arguments(resources, site, after),
-                format!("{COMMON}{expected}|/s/job.sh|7")
+                format!("{COMMON}{expected}|/s/50%/slurm/a/job.sh|1")
             );
         }
     }

@@ -3,7 +3,6 @@ use std::ffi::OsStr;
 use std::path::Path;
 
 use crate::SlurmError;
-use crate::arguments::JobRequest;
 use crate::commands::Slurm;
 use crate::queue::Queue;
 use crate::site::Site;
@@ -99,22 +98,12 @@ impl Submission {
         ids: &[Option<String>],
         options: &SubmitOptions<'_>,
     ) -> Result<String, SlurmError> {
-        let task = &self.tasks[number];
+        let parents = &self.tasks[number].parents;
         let mut after: Vec<&str> =
-            task.parents.iter().filter_map(|&parent| ids[parent].as_deref()).collect();
+            parents.iter().filter_map(|&parent| ids[parent].as_deref()).collect();
         after.sort_unstable_by_key(|id| (id.len(), *id));
         after.dedup();
-        let job = JobRequest {
-            name: &task.label,
-            resources: &task.resources,
-            site: options.site,
-            after: &after,
-            working_folder: options.working_folder,
-            log: &self.log_path(number),
-            script: &self.script_path(),
-            number,
-        };
-        options.slurm.sbatch(&job.arguments())
+        options.slurm.sbatch(&self.arguments(number, options.site, &after, options.working_folder))
     }
 }
 
