@@ -20,14 +20,17 @@ pub(crate) struct Root {
     pub(crate) with_inputs: bool,
 }
 
-/// Choices of the caller: ages and kinds of entries to keep.
-#[derive(Debug, Clone, Copy)]
+// Choices of the caller: ages and kinds of entries to keep. Doc comments are the options' help.
+#[derive(Debug, Clone, Copy, clap::Args)]
 pub(crate) struct Policy {
-    /// Age, in days since the last use, below which an entry is kept.
+    /// Keep artifacts that were created or used in the last N days
+    #[arg(long, default_value_t = 7, value_name = "N")]
     pub(crate) keep_days: u64,
-    /// True to delete checkpoints of actions that no process is working on.
+    /// Delete checkpoints of interrupted stages, too
+    #[arg(long)]
     pub(crate) drop_unfinished: bool,
-    /// True to delete artifacts whose keys have an older version.
+    /// Delete artifacts of older versions of nerf-sr, too; no plan can use them any more
+    #[arg(long)]
     pub(crate) drop_old: bool,
 }
 

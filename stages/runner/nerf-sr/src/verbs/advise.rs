@@ -14,11 +14,16 @@ use crate::state_text::processors_text;
 /// Target that refines views, in a project's pipelines/.
 const REFINING_TARGET: &str = "refined";
 
-/// Limits within which a quality is chosen.
-#[derive(Clone, Copy, Debug)]
+// Limits within which a quality is chosen. Doc comments are the options' help.
+#[derive(Clone, Copy, Debug, clap::Args)]
 pub(crate) struct Limits {
-    pub(crate) minutes: Option<f64>,
-    pub(crate) memory: Option<Memory>,
+    /// Time that the run may take; the best quality within it is chosen [without a limit:
+    /// balanced]
+    #[arg(long, value_name = "N")]
+    minutes: Option<f64>,
+    /// Memory limit of the run, such as 8G; the best quality whose largest stage fits is chosen
+    #[arg(long, value_name = "AMOUNT")]
+    memory: Option<Memory>,
 }
 
 /// Processor time and memory of some stages.
