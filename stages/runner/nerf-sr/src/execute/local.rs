@@ -6,11 +6,10 @@ use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc;
 
-use anyhow::Context as _;
 use artifact::{Failure, print_line, print_lines, report_line, report_text};
-use planning::stage_call::{Display, StageFailure};
+use planning::stage_call::{Display, StageFailure, read_summary};
 use planning::{Node, Sink};
-use stage::{SUMMARY_FILE, available_memory};
+use stage::available_memory;
 use store::Record;
 
 use super::Executor;
@@ -63,7 +62,7 @@ impl Executor for Local {
             report_text(&self.hint.message(&node.label(), &node.stage, skipped));
             return Ok(ExitCode::from(failure.code));
         }
-        print_summaries(run, &outcome)?;
+        print_summaries(run, &outcome);
         let sinks = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
         if let Some(code) = sinks.first_failure {
             return Ok(ExitCode::from(code));
@@ -226,7 +225,7 @@ impl<'a> Schedule<'a> {
     }
 
     /// Finds the stages that render and score a node's checkpoints, if `--watch` is given.
-    fn watch(&self, index: usize) -> Option<(&'a Watch, Chain)> {
+    fn watch(&self, index: usize) -> Option<(&'a Watch, Chain<'a>)> {
         let plan = self.run.plan;
         let has_checkpoints = plan.nodes[index].program.description.from_checkpoint;
         let watch = self.options.watch.as_ref().filter(|_| has_checkpoints)?;
@@ -320,22 +319,18 @@ impl<'a> Schedule<'a> {
 }
 
 /// Prints the summary of each node that is no other node's parent.
-fn print_summaries(run: &Run<'_>, outcome: &Outcome) -> anyhow::Result<()> {
+fn print_summaries(run: &Run<'_>, outcome: &Outcome) {
     let plan = run.plan;
     let parents: BTreeSet<usize> = plan.nodes.iter().flat_map(Node::parents).collect();
     for (index, node) in plan.nodes.iter().enumerate() {
         if parents.contains(&index) {
             continue;
         }
-        let record = outcome.records[index]
-            .as_ref()
-            .with_context(|| format!("{} has no record", node.label()))?;
-        let file = run.store.object(&record.output).join(SUMMARY_FILE);
-        if let Some(summary) =
-            record.summary.clone().or_else(|| std::fs::read_to_string(&file).ok())
+        let Some(record) = &outcome.records[index] else { continue };
+        let recorded = record.summary.clone();
+        if let Some(summary) = recorded.or_else(|| read_summary(&run.store.object(&record.output)))
         {
             print_lines(&format!("{}: {summary}", node.label()));
         }
     }
-    Ok(())
 }

@@ -18,8 +18,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use planning::stage_call::{Call, Display, StageFailure, Watcher};
-use stage::{Event, SUMMARY_FILE};
+use planning::stage_call::{Call, Display, StageFailure, Watcher, read_summary};
+use stage::Event;
 
 pub(crate) use chain::Chain;
 use chain::Link;
@@ -46,7 +46,7 @@ pub(crate) struct Watch {
 /// A watched training.
 pub(crate) struct Watching<'a> {
     pub(crate) watch: &'a Watch,
-    pub(crate) chain: &'a Chain,
+    pub(crate) chain: &'a Chain<'a>,
     pub(crate) label: &'a str,
     /// Temporary folder of this training's looks, removed when the training ends.
     pub(crate) scratch: PathBuf,
@@ -165,8 +165,8 @@ impl Look<'_> {
         let scoring = self.call_link(score, "score", &views, &scores)?;
         Ok(Some(LookResult {
             picture: views.join(scene::preview_file(&self.view.name)),
-            field: read_summary(&field)?,
-            scores: read_summary(&scores)?,
+            field: read_summary(&field).unwrap_or_default().trim().to_owned(),
+            scores: read_summary(&scores).unwrap_or_default().trim().to_owned(),
             processor: reading + rendering + scoring,
         }))
     }
@@ -175,7 +175,7 @@ impl Look<'_> {
     /// view. Returns the processor time.
     fn call_link(
         &self,
-        link: &Link,
+        link: &Link<'_>,
         name: &str,
         previous: &Path,
         output: &Path,
@@ -183,25 +183,25 @@ impl Look<'_> {
         let scratch = self.watching.scratch.join(format!("{name}-inputs"));
         let params = scratch.join("params.json");
         std::fs::create_dir_all(&scratch)
-            .and_then(|()| artifact::write_json(&params, &link.parameters))
+            .and_then(|()| artifact::write_json(&params, &link.node.parameters))
             .map_err(|e| StageFailure::at(&params, &e))?;
-        let mut inputs = vec![(link.chained_input.clone(), previous.to_path_buf())];
+        let mut inputs = vec![(link.chained_input.to_owned(), previous.to_path_buf())];
         for (input, folder) in &link.inputs {
             let cut = scratch.join(input);
             self.view.copy_cut(folder, &cut).map_err(|e| StageFailure::at(&cut, &e))?;
-            inputs.push((input.clone(), cut));
+            inputs.push(((*input).to_owned(), cut));
         }
         self.call(&Call {
             label: self.watching.label,
-            program: &link.program.path,
-            description: &link.program.description,
+            program: &link.node.program.path,
+            description: &link.node.program.description,
             params: &params,
             inputs: &inputs,
             hashes: &[],
             output,
             work: None,
             from_checkpoint: false,
-            device: &link.device,
+            device: link.device,
             threads: 1,
             lock: None,
         })
@@ -214,13 +214,6 @@ impl Look<'_> {
         let usage = call.run(&self.watching.scratch.join("log"), &deadline, &stop)?;
         Ok(Duration::from_secs_f64(usage.processor_seconds))
     }
-}
-
-/// Reads the summary in a stage's output.
-fn read_summary(output: &Path) -> Result<String, StageFailure> {
-    let file = output.join(SUMMARY_FILE);
-    let text = std::fs::read_to_string(&file).map_err(|e| StageFailure::at(&file, &e))?;
-    Ok(text.trim().to_owned())
 }
 
 /// Stops a call when the training has ended or the deadline has passed. Prints nothing.

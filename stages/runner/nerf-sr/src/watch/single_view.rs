@@ -16,7 +16,7 @@ pub(super) struct WatchedView {
 
 impl WatchedView {
     /// Finds a view by name, or the chain's first view if the name is empty.
-    pub(super) fn find(chain: &Chain, name: &str) -> anyhow::Result<Self> {
+    pub(super) fn find(chain: &Chain<'_>, name: &str) -> anyhow::Result<Self> {
         let mut views: Vec<Value> = Vec::new();
         for (_, folder) in &chain.render.inputs {
             if let Ok(mut list) = read_list(folder) {
