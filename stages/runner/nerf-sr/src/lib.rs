@@ -62,13 +62,19 @@ pub fn main() -> ExitCode {
     cli::run_command_line().unwrap_or_else(|error| {
         report_line!("nerf-sr: {}", artifact::one_line(&error));
         let plan_error = error.chain().find_map(|e| e.downcast_ref::<PlanError>());
-        ExitCode::from(plan_error.map_or_else(|| artifact::exit_code(&error), plan_exit_code))
+        let stage_failure = error.chain().find_map(|e| e.downcast_ref::<StageFailure>());
+        let code = plan_error.map(plan_exit_code).or(stage_failure.map(|failure| failure.code));
+        ExitCode::from(code.unwrap_or_else(|| artifact::exit_code(&error)))
     })
 }
 
 /// Returns a failure with exit code 1.
 fn failure(error: impl std::fmt::Display) -> StageFailure {
-    StageFailure { code: StageFailure::FAILED, message: error.to_string() }
+    failure_with(StageFailure::FAILED, error)
+}
+
+fn failure_with(code: u8, error: impl std::fmt::Display) -> StageFailure {
+    StageFailure { code, message: error.to_string() }
 }
 
 fn plan_exit_code(error: &PlanError) -> u8 {

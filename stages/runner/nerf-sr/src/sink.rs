@@ -18,7 +18,7 @@ use crate::page::PageMark;
 use crate::publish::{has_current_page, publish};
 use crate::run_record::{RunProgress, add_details, run_record, shown_results};
 use crate::session::Run;
-use crate::unchanged::ConfirmedProgram;
+use crate::unchanged::call_confirmed;
 
 /// Returns the identity of a sink's page: a hash of the record, the sink's code, parameters and
 /// environment variables. Values that the scene decides follow from these, so they aren't hashed.
@@ -122,7 +122,9 @@ pub(crate) fn run_sink(
     add_details(&mut record, run.plan, sink, progress);
     let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
     let output = scratch.join("output");
-    call(run, sink, threads, &record, &scratch, &output)?;
+    call_confirmed(&sink.program, run.store, run.stop, || {
+        call(run, sink, threads, &record, &scratch, &output)
+    })?;
     if output.symlink_metadata().is_err() {
         return Err(failure(StoreError::missing_output()));
     }
@@ -158,7 +160,6 @@ fn call(
         .and_then(|()| write_json(&folder.join("run.json"), record))
         .and_then(|()| write_json(&params, &sink.parameters))
         .map_err(|e| StageFailure::at(scratch, &e))?;
-    let program = ConfirmedProgram::new(&sink.program, run.store, run.stop)?;
     let display = Display::new();
     let view = display.start(&sink.stage);
     let call = Call {
@@ -177,8 +178,7 @@ fn call(
     };
     let result = call.run(&scratch.join("log"), &view, run.stop);
     view.end();
-    result?;
-    program.confirm_again()
+    result.map(drop)
 }
 
 #[cfg(test)]

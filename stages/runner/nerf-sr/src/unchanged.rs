@@ -15,48 +15,31 @@ use planning::{
 };
 use store::{Attempt, Store};
 
-use crate::failure;
+use crate::{failure, failure_with, plan_exit_code};
 
-/// A program that was confirmed before its start.
-pub(crate) struct ConfirmedProgram<'a> {
-    program: &'a StageProgram,
-    store: &'a Store,
-    stamp: Stamp,
-}
-
-impl<'a> ConfirmedProgram<'a> {
-    /// Confirms that a program is the planned one.
-    pub(crate) fn new(
-        program: &'a StageProgram,
-        store: &'a Store,
-        stop: &AtomicBool,
-    ) -> Result<Self, StageFailure> {
-        let stamp = program.confirm(store, Some(stop)).map_err(|e| confirmation_failure(&e))?;
-        Ok(Self { program, store, stamp })
-    }
-
-    /// Confirms after the program's end that the program was not changed since [`Self::new`]. Only
-    /// a second signal interrupts this: the first one must not cost a result.
-    pub(crate) fn confirm_again(&self) -> Result<(), StageFailure> {
-        let confirmed = self.program.confirm_since(&self.stamp, self.store, None);
-        confirmed.map_err(|e| confirmation_failure(&e))
-    }
+/// Calls a program if it is the planned one, and fails if it was changed until its end. Only a
+/// second signal interrupts the latter check: the first one must not cost a result.
+pub(crate) fn call_confirmed<T>(
+    program: &StageProgram,
+    store: &Store,
+    stop: &AtomicBool,
+    call: impl FnOnce() -> Result<T, StageFailure>,
+) -> Result<T, StageFailure> {
+    let start = program.confirm(store, Some(stop)).map_err(|e| confirmation_failure(&e))?;
+    let result = call()?;
+    program.confirm_since(&start, store, None).map_err(|e| confirmation_failure(&e))?;
+    Ok(result)
 }
 
 fn confirmation_failure(problem: &ConfirmError) -> StageFailure {
     let is_interrupted = matches!(problem, ConfirmError::Interrupted);
     let code = if is_interrupted { StageFailure::INTERRUPTED } else { StageFailure::USAGE };
-    StageFailure { code, message: problem.to_string() }
+    failure_with(code, problem)
 }
 
 /// Returns the failure of a stage whose inputs can't be used.
 pub(crate) fn input_failure(problem: &PlanError) -> StageFailure {
-    let code = match problem {
-        PlanError::Source { .. } | PlanError::Artifact(_) => StageFailure::BAD_INPUT,
-        PlanError::Interrupted => StageFailure::INTERRUPTED,
-        PlanError::Pipeline(_) | PlanError::Store(_) | PlanError::Usage(_) => StageFailure::FAILED,
-    };
-    StageFailure { code, message: problem.to_string() }
+    failure_with(plan_exit_code(problem), problem)
 }
 
 /// Inputs of a node, as they were when the key was computed.
@@ -119,12 +102,12 @@ impl<'a> Inputs<'a> {
             let now = read_source(self.store, self.node, name, folder, stop)
                 .map_err(|e| input_failure(&e))?;
             if let Some(change) = now.change_since(&self.sources[name]) {
-                let message = format!(
+                let problem = format!(
                     "input {name} ({}): {change} since it was hashed, so no result is recorded; \
                     run again",
                     folder.display()
                 );
-                return Ok(Some(StageFailure { code: StageFailure::BAD_INPUT, message }));
+                return Ok(Some(failure_with(StageFailure::BAD_INPUT, problem)));
             }
         }
         match self.artifacts.iter().try_for_each(StoredInput::check) {
@@ -160,7 +143,7 @@ impl<'a> Inputs<'a> {
 }
 
 fn damage_failure(damage: &Damage) -> StageFailure {
-    StageFailure { code: StageFailure::BAD_INPUT, message: damage.to_string() }
+    failure_with(StageFailure::BAD_INPUT, damage)
 }
 
 /// An input from the store.

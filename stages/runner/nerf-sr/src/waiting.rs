@@ -1,13 +1,13 @@
 //! Waits for locks. Each wait reports the lock's holder and ends on a signal.
 
-use artifact::format_duration;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use artifact::{Failure, format_duration};
 use planning::stage_call::StageFailure;
 use store::{Entered, Holder, Locked, Store, StoreError, host_name};
 
-use crate::failure;
+use crate::{failure, failure_with};
 
 /// Interval between two attempts to lock; chosen by hand.
 const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
@@ -29,8 +29,7 @@ pub(crate) fn wait_for_lock<T>(
             Locked::Acquired(held) => return Ok(held),
             Locked::HeldBy(holder) => {
                 if stop.load(Ordering::Relaxed) {
-                    let message = "interrupted while waiting for a lock".to_owned();
-                    return Err(StageFailure { code: StageFailure::INTERRUPTED, message });
+                    return Err(failure_with(StageFailure::INTERRUPTED, Failure::Interrupted));
                 }
                 if begin.elapsed() >= next_notice {
                     report(holder.as_ref(), begin.elapsed());

@@ -14,7 +14,7 @@ use store::{Attempt, Entered, Holder, KeyLock, Record, Store, TimeSpent, Unfinis
 use crate::estimates::{Estimate, comparison_text};
 use crate::failure;
 use crate::session::Run;
-use crate::unchanged::{ConfirmedProgram, Inputs, input_failure};
+use crate::unchanged::{Inputs, call_confirmed, input_failure};
 use crate::waiting::{enter_store, holder_text, wait_for_lock};
 use crate::watch::{Chain, Watch, Watching, scratch_name};
 
@@ -42,7 +42,7 @@ pub(crate) struct NodeJob<'a> {
     /// Expected cost.
     pub(crate) estimate: Option<Estimate>,
     /// Stages that render and score the node's checkpoints, if the node is watched.
-    pub(crate) watch: Option<(&'a Watch, Chain)>,
+    pub(crate) watch: Option<(&'a Watch, Chain<'a>)>,
 }
 
 impl NodeJob<'_> {
@@ -130,7 +130,11 @@ impl NodeJob<'_> {
         action: Unfinished,
         inputs: &Inputs<'_>,
     ) -> Result<Record, StageFailure> {
-        let (peak_memory, time) = self.call(lock, &attempt, inputs)?;
+        let store = self.run.store;
+        let (peak_memory, time) = call_confirmed(&self.node.program, store, self.run.stop, || {
+            self.call(lock, &attempt, inputs)
+        })?;
+        inputs.check_again(&attempt)?;
         let record = Record {
             stage: action.stage,
             point: action.point,
@@ -147,8 +151,8 @@ impl NodeJob<'_> {
             summary: read_summary(&attempt.output),
         };
         let kind = &self.node.program.description.output.kind;
-        let checked = self.run.store.check(attempt, kind).map_err(failure)?;
-        let record = self.run.store.publish(&self.enter()?, checked, record).map_err(failure)?;
+        let checked = store.check(attempt, kind).map_err(failure)?;
+        let record = store.publish(&self.enter()?, checked, record).map_err(failure)?;
         let estimate = self.estimate.and_then(|estimate| comparison_text(&estimate, &record));
         self.report(&format!(
             "done in {}, artifact {}{}",
@@ -160,8 +164,7 @@ impl NodeJob<'_> {
     }
 
     /// Calls the stage. Returns its peak memory, and the time of the call and of the calls whose
-    /// checkpoints it resumed from. Fails if the program or an input differs from the one in the
-    /// key, before or after the call.
+    /// checkpoints it resumed from. Fails if an input differs from the one in the key.
     fn call(
         &self,
         lock: &KeyLock,
@@ -169,7 +172,6 @@ impl NodeJob<'_> {
         inputs: &Inputs<'_>,
     ) -> Result<(u64, TimeSpent), StageFailure> {
         let label = self.node.label();
-        let program = ConfirmedProgram::new(&self.node.program, self.run.store, self.run.stop)?;
         inputs.check(self.run.stop)?;
         if inputs.drop_doubtful_checkpoints(attempt).map_err(failure)? {
             self.report("an input was written to after the checkpoint; starting over");
@@ -205,10 +207,7 @@ impl NodeJob<'_> {
         stage_display.end();
         // Without the file, only the record's time is too short.
         attempt.record_time_spent(&time).ok();
-        result?;
-        program.confirm_again()?;
-        inputs.check_again(attempt)?;
-        Ok((usage.peak_memory, time))
+        result.map(|()| (usage.peak_memory, time))
     }
 
     /// Runs the stage. If the node is watched, a second thread takes looks until the stage ends.

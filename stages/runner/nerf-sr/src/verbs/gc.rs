@@ -3,8 +3,7 @@ use std::time::Duration;
 
 use crate::garbage::{Collection, Policy, Root};
 use anyhow::Context as _;
-use artifact::{Failure, format_duration, format_size, print_line, report_line};
-use planning::stage_call::StageFailure;
+use artifact::{format_duration, format_size, print_line, report_line};
 use planning::{PlanError, Request, stored_inputs};
 use serde_json::json;
 use stage::stop_on_signals;
@@ -27,14 +26,7 @@ pub(crate) fn gc(
         return output.print(&Collection::new(store, root, policy).context(UNREADABLE)?);
     }
     let stop = stop_on_signals()?;
-    let closed = match wait_for_lock(&stop, &|_, waited| report_wait(waited), || store.try_close())
-    {
-        Ok(closed) => closed,
-        Err(failure) if failure.code == StageFailure::INTERRUPTED => {
-            return Err(Failure::Interrupted.into());
-        }
-        Err(failure) => return Err(failure.into()),
-    };
+    let closed = wait_for_lock(&stop, &|_, waited| report_wait(waited), || store.try_close())?;
     let collection = Collection::new(store, root, policy).context(UNREADABLE)?;
     collection.carry_out(store, &closed)?;
     drop(closed);

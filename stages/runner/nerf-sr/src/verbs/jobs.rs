@@ -16,6 +16,7 @@ use store::{Record, Store};
 use super::run::begin_run;
 use crate::estimates::Estimates;
 use crate::execute::NodeJob;
+use crate::failure_with;
 use crate::run_record::RunProgress;
 use crate::session::Run;
 use crate::sink::run_sink;
@@ -134,9 +135,9 @@ fn check_parents(
         return Ok(());
     };
     let parent = plan.nodes[parent].label();
-    let message = format!(
+    let problem = format!(
         "{label} needs {parent}, which has no artifact: its job failed, was cancelled, or is \
         unknown to Slurm; run again"
     );
-    Err(StageFailure { code: StageFailure::BAD_INPUT, message })
+    Err(failure_with(StageFailure::BAD_INPUT, problem))
 }

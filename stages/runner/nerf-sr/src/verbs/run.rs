@@ -1,8 +1,8 @@
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
-use artifact::{Failure, report_line};
+use artifact::report_line;
 use planning::stage_call::{StageFailure, stop_on_signals};
 use planning::{Describing, Plan, Request, State, stored_inputs};
 use store::{RunFile, Store};
@@ -24,12 +24,7 @@ pub(crate) fn run(
     let plan = session.new_plan(request, Describing::OwnAndNeeded(&stop))?;
     check_not_in_input(&plan, "the folder of pages", out)?;
     plan.check_folders()?;
-    let (file, states) = match begin_run(&session.store, &plan, &stop) {
-        Ok(begun) => begun,
-        // A signal that ends the wait for the store isn't an error of the store.
-        Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),
-        Err(error) => return Err(error.into()),
-    };
+    let (file, states) = begin_run(&session.store, &plan, &stop)?;
     let store = &session.store;
     let estimates = &Estimates::new(&plan, &states, store);
     let run = Run { plan: &plan, store, file: &file, out, estimates, stop: &stop };
