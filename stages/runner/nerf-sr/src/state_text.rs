@@ -23,11 +23,6 @@ pub(crate) fn blocking_nodes(states: &[State], index: usize) -> BTreeSet<usize> 
     found
 }
 
-/// Returns a number of processors as text.
-pub(crate) fn processors_text(count: usize) -> String {
-    if count == 1 { "1 processor".to_owned() } else { format!("{count} processors") }
-}
-
 /// Describes a node's state. With records, explains why the node will run.
 pub(crate) fn state_text(
     session: &Session,
@@ -38,7 +33,11 @@ pub(crate) fn state_text(
 ) -> String {
     match (state, records) {
         (State::Cached(record), _) => {
-            format!("cached ({}, took {})", age_text(record), format_duration(record.seconds))
+            format!(
+                "cached ({}, took {})",
+                age_text(record.started_unix),
+                format_duration(record.seconds)
+            )
         }
         (State::Waits { on }, _) => {
             let names: Vec<String> = on.iter().map(|&parent| plan.nodes[parent].label()).collect();
@@ -102,9 +101,9 @@ pub(crate) fn sink_text(plan: &Plan, sink: &Sink, states: &[State]) -> String {
     format!("shows {}; {when}", names.join(", "))
 }
 
-/// Returns the time since an action started: `5 s ago`.
-pub(crate) fn age_text(record: &Record) -> String {
-    match unix_time().saturating_sub(record.started_unix) {
+/// Returns the time that has passed since a time: `5 s ago`.
+pub(crate) fn age_text(unix: u64) -> String {
+    match unix_time().saturating_sub(unix) {
         s if s < 120 => format!("{s} s ago"),
         s if s < 7200 => format!("{} min ago", s / 60),
         s if s < 172_800 => format!("{} h ago", s / 3600),

@@ -6,7 +6,6 @@ use stage::MEMORY_REMEDY;
 use store::Record;
 
 use super::{Estimate, Estimates};
-use crate::state_text::processors_text;
 
 impl Estimate {
     /// Returns time and memory as text.
@@ -33,7 +32,7 @@ impl Estimates {
             "about {} of processor time: {} on {}; at most {} of memory for a stage{without}",
             format_duration(seconds),
             format_duration(seconds / processors as f64),
-            processors_text(processors),
+            format_count(processors, "processor"),
             format_size(self.memory())
         ))
     }

@@ -5,6 +5,7 @@ use slurm::{Queue, Slurm};
 use store::{PartialKey, Run, Store, StoreError};
 
 use crate::garbage::contents::Contents;
+use crate::state_text::age_text;
 
 /// Actions to keep, with the reason.
 #[derive(Debug, Clone, Default)]
@@ -62,8 +63,7 @@ pub(crate) fn find_roots(
             let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
             roots.push(run_root(format!("needed by the run of process {process}"), run));
         } else if policy.is_recent(run.last_used_unix()) {
-            roots
-                .push(run_root(format!("used by a run {}", format_age(run.last_used_unix())), run));
+            roots.push(run_root(format!("used by a run {}", age_text(run.last_used_unix())), run));
         }
     }
     for key in store.locked_keys()? {
@@ -71,7 +71,7 @@ pub(crate) fn find_roots(
     }
     for (key, record) in &contents.records {
         if policy.is_recent(record.started_unix) {
-            let reason = format!("created {}", format_age(record.started_unix));
+            let reason = format!("created {}", age_text(record.started_unix));
             roots.push(action_root(reason, key));
         }
         if !policy.drop_old && record.has_old_key() {
@@ -117,9 +117,4 @@ fn action_root(reason: String, key: &str) -> Root {
 
 fn run_root(reason: String, run: Run) -> Root {
     Root { reason, keys: run.keys, waiting: run.waiting, with_inputs: false }
-}
-
-fn format_age(unix: u64) -> String {
-    let hours = unix_time().saturating_sub(unix) / 3600;
-    if hours < 48 { format!("{hours} h ago") } else { format!("{} days ago", hours / 24) }
 }

@@ -9,7 +9,6 @@ use slurm::Memory;
 use crate::estimates::Estimates;
 use crate::run_messages::command_text;
 use crate::session::Session;
-use crate::state_text::processors_text;
 
 /// Target that refines views, in a project's pipelines/.
 const REFINING_TARGET: &str = "refined";
@@ -104,7 +103,7 @@ pub(crate) fn advise(
 
 fn print_table(all: &[QualityCosts], processors: usize) {
     let columns = COLUMNS.map(|(name, _)| format!("{name:<20}"));
-    let on = processors_text(processors);
+    let on = format_count(processors, "processor");
     print_line!("{:<9} {} in all, on {on}", "quality", columns.join(" "));
     for costs in all {
         let parts = costs.parts.map(|part| format!("{:<20}", part.text(processors)));

@@ -58,12 +58,17 @@ pub(crate) struct GcOutput {
 
 impl GcOutput {
     fn print(self, collection: &Collection) -> anyhow::Result<ExitCode> {
-        let (deleted, kept) = collection.bytes();
+        let decisions = collection.decisions();
+        let (mut deleted, mut kept) = (0, 0);
+        for decision in &decisions {
+            let total = if decision.kept_because.is_some() { &mut kept } else { &mut deleted };
+            *total += decision.bytes.unwrap_or(0);
+        }
         if self.json {
             return print_json(&json!({"dry_run": self.dry_run, "bytes_gone": deleted,
-                "bytes_left": kept, "items": collection.decisions()}));
+                "bytes_left": kept, "items": decisions}));
         }
-        for decision in collection.decisions() {
+        for decision in decisions {
             print_line!("{decision}");
         }
         let [deleted, kept] = [deleted, kept].map(format_size);

@@ -126,6 +126,6 @@ fn cached_detail(session: &Session, record: &Record) -> String {
         short_hash(&record.output),
         format_size(size),
         format_duration(record.seconds),
-        age_text(record)
+        age_text(record.started_unix)
     )
 }
