@@ -6,16 +6,14 @@ use serde_json::Value;
 use store::ModelCost;
 use workload::{ExportViews, program_bytes};
 
-use super::work::{Images, Work};
+use super::work::Work;
 use training::{field_factor, training_memory, training_need, training_seconds};
 
-/// Seconds per rendered ray, of objects and of opaque scenes (docs/results/engine.md).
-const OBJECT_RENDERED_RAY_SECONDS: f64 = 4.4e-6;
-const OPAQUE_RENDERED_RAY_SECONDS: f64 = 8e-6;
-/// Fraction of the pixels that get all rays at the default tolerance, likewise; taken for any
-/// tolerance above 0.
-const OBJECT_DETAILED_PIXELS: f64 = 0.23;
-const OPAQUE_DETAILED_PIXELS: f64 = 0.29;
+/// Seconds per rendered ray, and fraction of the pixels that get all rays at the default tolerance,
+/// which is taken for any tolerance above 0: of objects and of opaque scenes
+/// (docs/results/engine.md).
+const OBJECT_RENDERING: (f64, f64) = (4.4e-6, 0.23);
+const OPAQUE_RENDERING: (f64, f64) = (8e-6, 0.29);
 /// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
 const RENDERED_BYTES_PER_FLOAT: u64 = 7;
 /// Bytes of `render-depth` without its field and libtorch, but with the rays of a band of rows; as
@@ -24,12 +22,10 @@ const RENDERER_BYTES: u64 = 28_000_000;
 /// Bytes of any other program that can contain libtorch, without it and data; as in the tests
 /// below.
 const PROGRAM_BYTES: u64 = 5_000_000;
-/// Seconds per pixel of `eval` without and with LPIPS: lego 100×2, 12 views.
-const SCORED_PIXEL_SECONDS: f64 = 1.4e-6;
-const LPIPS_PIXEL_SECONDS: f64 = 2.2e-6;
-/// Bytes per pixel of a view that `eval` scores, without and with LPIPS.
-const SCORED_PIXEL_BYTES: u64 = 125;
-const LPIPS_PIXEL_BYTES: u64 = 580;
+/// Seconds and bytes per pixel of a view that `eval` scores, without and with LPIPS: lego 100×2, 12
+/// views.
+const SCORED_PIXEL: (f64, u64) = (1.4e-6, 125);
+const LPIPS_PIXEL: (f64, u64) = (2.2e-6, 580);
 /// Seconds per photograph's pixel of `prep`.
 const PREPARED_PIXEL_SECONDS: f64 = 30e-9;
 /// Bytes of `prep` without data, and peak memory of each further thread over that of the first:
@@ -94,15 +90,20 @@ fn libtorch_bytes(work: &Work) -> u64 {
     program_bytes(work.has_libtorch) - program_bytes(false)
 }
 
+/// Returns the bytes of a program that can contain libtorch, without data.
+fn torch_program_bytes(work: &Work) -> u64 {
+    PROGRAM_BYTES + libtorch_bytes(work)
+}
+
 /// Returns the bytes of data of the views that are processed at a time, one by each thread.
-fn concurrent_bytes(work: &Work, images: &Images, bytes_per_pixel: u64) -> u64 {
-    images.count.min(work.threads) * bytes_per_pixel * images.largest_pixels()
+fn concurrent_bytes(work: &Work, bytes_per_pixel: u64) -> u64 {
+    work.images.count.min(work.threads) * bytes_per_pixel * work.images.largest_pixels()
 }
 
 fn demo_scene(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let ray = if work.kind.is_opaque() { BACKDROP_RAY_SECONDS } else { DEMO_RAY_SECONDS };
     let pixel = DEMO_PIXEL_SECONDS + ray * number(parameters, "samples_per_axis")?.powi(2);
-    let memory = DEMO_BYTES + concurrent_bytes(work, &work.images, DEMO_PIXEL_BYTES);
+    let memory = DEMO_BYTES + concurrent_bytes(work, DEMO_PIXEL_BYTES);
     Some((work.images.pixels as f64 * pixel, memory))
 }
 
@@ -113,11 +114,7 @@ fn prep_memory(work: &Work) -> u64 {
 }
 
 fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
-    let (ray, detailed) = if work.kind.is_opaque() {
-        (OPAQUE_RENDERED_RAY_SECONDS, OPAQUE_DETAILED_PIXELS)
-    } else {
-        (OBJECT_RENDERED_RAY_SECONDS, OBJECT_DETAILED_PIXELS)
-    };
+    let (ray, detailed) = if work.kind.is_opaque() { OPAQUE_RENDERING } else { OBJECT_RENDERING };
     let field = work.field.as_ref()?;
     if field["field"] == "mlp" {
         return None;
@@ -140,13 +137,8 @@ fn rendering_memory(work: &Work) -> Option<u64> {
 }
 
 fn scoring(work: &Work) -> (f64, u64) {
-    let (seconds, bytes) = if work.computes_lpips {
-        (LPIPS_PIXEL_SECONDS, LPIPS_PIXEL_BYTES)
-    } else {
-        (SCORED_PIXEL_SECONDS, SCORED_PIXEL_BYTES)
-    };
-    let program = PROGRAM_BYTES + libtorch_bytes(work);
-    let memory = program + concurrent_bytes(work, &work.images, bytes);
+    let (seconds, bytes) = if work.computes_lpips { LPIPS_PIXEL } else { SCORED_PIXEL };
+    let memory = torch_program_bytes(work) + concurrent_bytes(work, bytes);
     (work.images.pixels as f64 * seconds, memory)
 }
 
@@ -156,15 +148,13 @@ fn refiner_training(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     }
     let patch = number(parameters, "patch_size")?.powi(2) * number(parameters, "batch_size")?;
     let seconds = number(parameters, "steps")? * patch * PATCH_PIXEL_SECONDS;
-    let program = PROGRAM_BYTES + libtorch_bytes(work);
-    Some((seconds, program + EXAMPLE_PIXEL_BYTES * work.images.pixels))
+    Some((seconds, torch_program_bytes(work) + EXAMPLE_PIXEL_BYTES * work.images.pixels))
 }
 
 fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let versions = number(parameters, "self_ensemble")?;
     let seconds = versions * work.images.pixels as f64 * REFINED_PIXEL_SECONDS;
-    let program = PROGRAM_BYTES + libtorch_bytes(work);
-    Some((seconds, program + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
+    Some((seconds, torch_program_bytes(work) + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
 }
 
 /// Returns the cost of an export: the time of its rendering, without the factor of the field's
@@ -178,11 +168,7 @@ fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let has_mesh = parameters["mesh"] == true;
     let nodes = if has_mesh { (number(parameters, "resolution")? + 1.0).powi(3) } else { 0.0 };
     let bytes = ExportViews { pixels }.bytes(nodes as u64);
-    let ray = if work.kind.is_opaque() {
-        OPAQUE_RENDERED_RAY_SECONDS
-    } else {
-        OBJECT_RENDERED_RAY_SECONDS
-    };
+    let (ray, _) = if work.kind.is_opaque() { OPAQUE_RENDERING } else { OBJECT_RENDERING };
     let field = work.field.as_ref()?;
     let seconds = number(field, "ensemble")? * pixels as f64 * ray;
     Some((seconds, rendering_memory(work)? + bytes))
@@ -192,7 +178,8 @@ fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
 mod tests {
     use serde_json::json;
 
-    use super::super::work::SceneKind;
+    use super::super::scene::SceneImages;
+    use super::super::work::{Images, SceneKind};
     use super::*;
 
     /// Returns work with square images; the field's LR width is their width.
@@ -294,13 +281,14 @@ mod tests {
             for (name, value) in changes.as_object().unwrap() {
                 parameters[name] = value.clone();
             }
-            let work = Work::of_demo(&parameters, 2).unwrap();
+            let scene = SceneImages::of_demo(&parameters, &Value::Null).unwrap();
+            let work = Work::of_demo(&scene, 2);
             let cost = model_cost("demo-scene", &parameters, &work).unwrap();
             let ratio = cost.processor_seconds / seconds;
             println!("{changes}: {:.2} s for {seconds} s", cost.processor_seconds);
             assert!((0.7..1.3).contains(&ratio), "{changes}: {ratio}");
         }
-        assert!(Work::of_demo(&json!({"size": 200}), 2).is_none());
+        assert!(SceneImages::of_demo(&json!({"size": 200}), &Value::Null).is_none());
     }
 
     /// Expected values are peak memory, in MB, from records of runs.

@@ -19,7 +19,7 @@ mod work;
 use std::collections::BTreeMap;
 
 use planning::{Node, Origin, Plan, State, nearest_record};
-use serde_json::{Map, Value, json};
+use serde_json::Value;
 use store::{ModelCost, Record, Store, host_name};
 
 pub(crate) use text::{check_memory, comparison_text, run_text, total_comparison_text};
@@ -91,16 +91,6 @@ impl Estimates {
     pub(crate) fn iter(&self) -> impl Iterator<Item = (usize, &Estimate)> {
         self.nodes.iter().enumerate().filter_map(|(index, node)| Some((index, node.as_ref()?)))
     }
-
-    /// Returns the processor seconds of all nodes.
-    pub(crate) fn processor_seconds(&self) -> f64 {
-        self.iter().map(|(_, estimate)| estimate.processor_seconds).sum()
-    }
-
-    /// Returns the largest memory of a node.
-    pub(crate) fn memory(&self) -> u64 {
-        self.iter().map(|(_, estimate)| estimate.memory).max().unwrap_or(0)
-    }
 }
 
 /// Data that estimates are computed from.
@@ -154,7 +144,7 @@ impl<'a> Estimator<'a> {
         let program = node.program.description.name.as_str();
         let known_parts = match state {
             State::WillRun { key_parts } => key_parts.clone(),
-            _ => partial_key_parts(node),
+            _ => planning::key_parts(node, &[], self.plan.device(&node.stage)),
         };
         let similar = self.records.iter().filter(|record| {
             let Some(other) = record.model else { return false };
@@ -171,7 +161,10 @@ impl<'a> Estimator<'a> {
         let program = node.program.description.name.as_str();
         let has_input = |name: &str| node.inputs.iter().any(|input| input.name == name);
         match program {
-            "demo-scene" => return Work::of_demo(&node.parameters, self.threads),
+            "demo-scene" => {
+                let scene = SceneImages::of_demo(&node.parameters, &Value::Null)?;
+                return Some(Work::of_demo(&scene, self.threads));
+            }
             "camera-path" => return Some(Work::default()),
             _ => {}
         }
@@ -222,11 +215,8 @@ impl<'a> Estimator<'a> {
             // Views are as many and as large as the cameras that they were rendered from.
             None => return self.images(parent).filter(|_| input == "views"),
         };
-        if input == "cameras"
-            && node.program.description.name == "render-depth"
-            && let Some(width) = node.parameters["size"].as_f64()
-        {
-            images = images.resized(width);
+        if node.program.description.name == "render-depth" {
+            images = images.with_size(&node.parameters);
         }
         Some((index, images))
     }
@@ -248,16 +238,6 @@ impl<'a> Estimator<'a> {
         let (index, _) = parent(node, "field")?;
         Some(&self.plan.nodes[index])
     }
-}
-
-/// Returns the known parts of a key whose inputs are unknown.
-fn partial_key_parts(node: &Node) -> Map<String, Value> {
-    let partial = node.partial_key();
-    let parameters = partial.parameters.into_iter();
-    let mut parts: Map<String, Value> =
-        parameters.map(|(name, value)| (format!("parameter {name}"), value)).collect();
-    parts.insert("stage".to_owned(), json!(partial.program));
-    parts
 }
 
 /// Returns the factors by which the model's time and memory are corrected after an earlier run.

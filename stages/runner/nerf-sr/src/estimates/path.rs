@@ -36,11 +36,7 @@ pub(super) fn recorded(parameters: &Value, folder: &Path) -> Option<Images> {
 
 fn frames(count: u64, largest_size: (u64, u64), parameters: &Value) -> Images {
     let pixels = largest_size.0.saturating_mul(largest_size.1).saturating_mul(count);
-    let images = Images { count, pixels, largest_size };
-    match parameters["size"].as_f64() {
-        Some(width) => images.resized(width),
-        None => images,
-    }
+    Images { count, pixels, largest_size }.with_size(parameters)
 }
 
 #[cfg(test)]

@@ -21,7 +21,7 @@ const CONTRACTION_WIDTHS: f64 = 2.0;
 const READING_BYTES: u64 = 4 + 4 + 6;
 
 /// Images of a scene, by the folders of the artifact that `prep` creates.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct SceneImages {
     pub(crate) kind: SceneKind,
     /// Width of the field's cube, in widths of an LR image.
@@ -43,7 +43,6 @@ const FOLDERS: [&str; 6] =
 /// Scene that `prep` will read.
 struct PlannedScene {
     kind: SceneKind,
-    widths_across: f64,
     /// Sizes of all photographs.
     sizes: Vec<(f64, f64)>,
     split: Split,
@@ -53,14 +52,7 @@ struct PlannedScene {
 impl SceneImages {
     /// Reads the images of an existing artifact.
     pub(crate) fn of_artifact(artifact: &Path) -> Option<Self> {
-        let mut scene = Self {
-            kind: SceneKind::Object,
-            widths_across: 1.0,
-            has_box_kernel: false,
-            photographs: Images::default(),
-            preparation_bytes: 0,
-            folders: Vec::new(),
-        };
+        let mut scene = Self { widths_across: 1.0, ..Self::default() };
         for folder in FOLDERS {
             let Ok(bytes) = std::fs::read(artifact.join(folder).join(VIEWS_FILE)) else {
                 continue;
@@ -99,11 +91,10 @@ impl SceneImages {
         let is_opaque = background.map_or(!is_object, |background| background == "opaque");
         let space = parameters["space"].as_str();
         let is_ndc = space.map_or(set.format == Format::Llff, |space| space == "ndc");
-        let kind = kind_of(is_opaque, is_ndc);
+        let sizes = set.frames.iter().map(Frame::intrinsics);
         let planned = PlannedScene {
-            kind,
-            widths_across: planned_widths_across(kind, space),
-            sizes: set.frames.iter().map(size_of).collect(),
+            kind: kind_of(is_opaque, is_ndc),
+            sizes: sizes.map(|size| (f64::from(size.width), f64::from(size.height))).collect(),
             split,
             is_benchmark: set.format.is_benchmark(),
         };
@@ -119,10 +110,8 @@ impl SceneImages {
         let size = (width, (width / number("aspect")?).round());
         let train = train as usize;
         let all = train + test as usize;
-        let kind = kind_of(demo["backdrop"].as_bool()?, false);
         let planned = PlannedScene {
-            kind,
-            widths_across: planned_widths_across(kind, parameters["space"].as_str()),
+            kind: kind_of(demo["backdrop"].as_bool()?, false),
             sizes: vec![size; all],
             split: Split { train: (0..train).collect(), test: (train..all).collect() },
             is_benchmark: true,
@@ -136,7 +125,7 @@ impl SceneImages {
         parameters: &Value,
         reading_bytes: impl Fn(usize) -> u64,
     ) -> Self {
-        let PlannedScene { kind, widths_across, sizes, split, is_benchmark } = planned;
+        let PlannedScene { kind, sizes, split, is_benchmark } = planned;
         let number = |name: &str| parameters[name].as_f64();
         let lr_width = number("lr_width");
         let is_downscaled = match parameters["lr_source"].as_str() {
@@ -173,7 +162,7 @@ impl SceneImages {
         });
         Self {
             kind: *kind,
-            widths_across: *widths_across,
+            widths_across: planned_widths_across(*kind, &parameters["space"]),
             has_box_kernel: is_mean_kernel(&parameters["kernel"], !is_downscaled),
             photographs: images(&read, 1.0),
             preparation_bytes: preparation.max().unwrap_or(0),
@@ -236,10 +225,10 @@ fn widths_across(space: &Value, views: &[Value]) -> Option<f64> {
     Some(side(0)?.max(side(1)?) * focal_lengths)
 }
 
-fn planned_widths_across(kind: SceneKind, space: Option<&str>) -> f64 {
+fn planned_widths_across(kind: SceneKind, space: &Value) -> f64 {
     match kind {
         SceneKind::Frustum => NDC_WIDTHS,
-        SceneKind::Unbounded if space != Some("box") => CONTRACTION_WIDTHS,
+        SceneKind::Unbounded if space != "box" => CONTRACTION_WIDTHS,
         SceneKind::Unbounded | SceneKind::Object => 1.0,
     }
 }
@@ -248,11 +237,6 @@ fn planned_widths_across(kind: SceneKind, space: Option<&str>) -> f64 {
 fn is_mean_kernel(kernel: &Value, by_default: bool) -> bool {
     let kernel = serde_json::from_value::<Kernel>(kernel.clone());
     kernel.map_or(by_default, |kernel| kernel.filter() == Filter::Box)
-}
-
-fn size_of(frame: &Frame) -> (f64, f64) {
-    let size = frame.intrinsics();
-    (f64::from(size.width), f64::from(size.height))
 }
 
 /// Returns number and size of images with the given widths and heights.
@@ -307,7 +291,6 @@ mod tests {
     fn photographs_are_the_lr_images() {
         let planned = PlannedScene {
             kind: SceneKind::Unbounded,
-            widths_across: 2.0,
             sizes: vec![(640.0, 480.0); 9],
             split: Split::hold_out(9),
             is_benchmark: false,

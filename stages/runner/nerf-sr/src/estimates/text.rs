@@ -22,8 +22,8 @@ fn cost_text(processor_seconds: f64, memory: u64) -> String {
 impl Estimates {
     /// Returns the cost of all nodes as text; `None` if there are no estimates.
     pub(crate) fn total_text(&self, processors: usize) -> Option<String> {
-        self.iter().next()?;
-        let seconds = self.processor_seconds();
+        let memory = self.iter().map(|(_, estimate)| estimate.memory).max()?;
+        let seconds: f64 = self.iter().map(|(_, estimate)| estimate.processor_seconds).sum();
         let without = match self.unknown {
             0 => String::new(),
             count => format!("; no estimate for {}", format_count(count, "other stage")),
@@ -33,7 +33,7 @@ impl Estimates {
             format_duration(seconds),
             format_duration(seconds / processors as f64),
             format_count(processors, "processor"),
-            format_size(self.memory())
+            format_size(memory)
         ))
     }
 }
