@@ -39,7 +39,7 @@ pub(crate) fn sink_parts(sink: &Sink) -> Map<String, Value> {
 /// True if a sink's page already shows these records.
 pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, records: &[Option<Record>]) -> bool {
     let record = run_record(run, sink, &RunProgress::not_started(records));
-    record.is_some_and(|record| {
+    record.is_some_and(|(record, _)| {
         has_current_page(&run.out.join(&sink.stage), &page_identity(sink, &record))
     })
 }
@@ -111,7 +111,7 @@ pub(crate) fn run_sink(
     threads: usize,
     progress: &RunProgress<'_>,
 ) -> Result<SinkResult, StageFailure> {
-    let Some(mut record) = run_record(run, sink, progress) else {
+    let Some((mut record, indices)) = run_record(run, sink, progress) else {
         return Ok(SinkResult::Incomplete);
     };
     let target = run.out.join(&sink.stage);
@@ -119,7 +119,7 @@ pub(crate) fn run_sink(
     if has_current_page(&target, &identity) {
         return Ok(SinkResult::UpToDate(target));
     }
-    add_details(&mut record, run.plan, sink, progress);
+    add_details(&mut record, run.plan, &indices, progress);
     let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
     let output = scratch.join("output");
     call_confirmed(&sink.program, run.store, run.stop, || {
@@ -136,8 +136,8 @@ pub(crate) fn run_sink(
             Manifest::of_folder(kind, &output).map_err(|e| StageFailure::at(&output, &e))?;
         write_json(&manifest, &found).map_err(|e| StageFailure::at(&manifest, &e))?;
     }
-    let mark =
-        PageMark { identity, results: Some(shown_results(&record)), data_sets: record.data_sets };
+    let results = Some(shown_results(&record, run.plan, &indices));
+    let mark = PageMark { identity, results, data_sets: record.data_sets };
     mark.write(&output).map_err(|e| StageFailure::at(&output, &e))?;
     let archived = publish(&output, &target, kind, run.stop)?;
     // Leftovers of a sink have no value.
