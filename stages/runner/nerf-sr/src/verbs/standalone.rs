@@ -15,9 +15,9 @@ use store::Store;
 /// Writes a pipeline for a folder of posed photographs, and prints what was found.
 pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
     let starter = Starter::new(folder, file)?;
-    print_line!("found: {}", starter.summary());
-    print_line!("sizes: {}", starter.sizes());
-    for note in starter.notes() {
+    print_line!("found: {}", starter.summary);
+    print_line!("sizes: {}", starter.sizes);
+    for note in &starter.notes {
         print_line!("  {note}");
     }
     let written = starter.write()?;
