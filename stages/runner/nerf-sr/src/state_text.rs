@@ -27,11 +27,11 @@ pub(crate) fn blocking_nodes(states: &[State], index: usize) -> BTreeSet<usize> 
 pub(crate) fn state_text(
     session: &Session,
     plan: &Plan,
+    states: &[State],
     index: usize,
-    state: &State,
     records: Option<&[Record]>,
 ) -> String {
-    match (state, records) {
+    match (&states[index], records) {
         (State::Cached(record), _) => {
             format!(
                 "cached ({}, took {})",

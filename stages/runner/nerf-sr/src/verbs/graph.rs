@@ -91,15 +91,10 @@ fn draw_for_graphviz(vertices: &[Vertex]) -> String {
     let mut text = "digraph pipeline {\n  rankdir=LR;\n  node [shape=box];\n".to_owned();
     for (i, vertex) in vertices.iter().enumerate() {
         let shape = if vertex.is_sink { ", shape=note" } else { "" };
-        text += &format!("  n{i} [label={}{shape}];\n", quoted(&vertex.label));
+        text += &format!("  n{i} [label={:?}{shape}];\n", vertex.label);
         for (parent, subtree) in &vertex.parents {
-            text += &format!("  n{parent} -> n{i} [label={}];\n", quoted(subtree));
+            text += &format!("  n{parent} -> n{i} [label={subtree:?}];\n");
         }
     }
     text + "}\n"
-}
-
-/// Quotes a text for Graphviz.
-fn quoted(text: &str) -> String {
-    format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\""))
 }

@@ -3,8 +3,7 @@
 use std::process::ExitCode;
 
 use artifact::{format_count, format_duration, format_size, hash_json, print_line};
-use planning::{Plan, Request, State, short_hash};
-
+use planning::{Request, State, short_hash};
 use store::Record;
 
 use super::print_json;
@@ -22,7 +21,7 @@ pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::
     let estimates = Estimates::new(&plan, &states, &session.store);
     for (index, state) in states.iter().enumerate() {
         let node = &plan.nodes[index];
-        let mut text = state_text(session, &plan, index, state, None);
+        let mut text = state_text(session, &plan, &states, index, None);
         if let Some(estimate) = estimates.get(index) {
             text += &format!("; about {}", estimate.text());
         }
@@ -54,35 +53,27 @@ pub(crate) fn why(
         let report = PlanReport::new(session, &plan, &states, &records)?;
         return print_json(&report.for_stage(stage));
     }
+    let explanation = |index: usize| {
+        let text = state_text(session, &plan, &states, index, Some(&records));
+        format!("{}: {text}", plan.nodes[index].label())
+    };
     if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
         print_line!("{stage}: {}", sink_text(&plan, sink, &states));
         for index in sink.nodes() {
-            print_line!("  {}", explanation(session, &plan, &states, &records, index));
+            print_line!("  {}", explanation(index));
         }
         return Ok(ExitCode::SUCCESS);
     }
     for index in nodes_of_stage(&plan, stage)? {
-        print_line!("{}", explanation(session, &plan, &states, &records, index));
+        print_line!("{}", explanation(index));
         if let Some(line) = by_scene_text(session, &plan.nodes[index], &states[index]) {
             print_line!("    {line}");
         }
         for cause in blocking_nodes(&states, index) {
-            print_line!("  {}", explanation(session, &plan, &states, &records, cause));
+            print_line!("  {}", explanation(cause));
         }
     }
     Ok(ExitCode::SUCCESS)
-}
-
-/// Returns a node's label and state, with the reason.
-fn explanation(
-    session: &Session,
-    plan: &Plan,
-    states: &[State],
-    records: &[Record],
-    index: usize,
-) -> String {
-    let text = state_text(session, plan, index, &states[index], Some(records));
-    format!("{}: {text}", plan.nodes[index].label())
 }
 
 /// Prints every stage with its artifact, age and running time.
