@@ -15,7 +15,6 @@ use slurm::{Memory, Site};
 
 use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
 use crate::garbage::Policy;
-use crate::run_messages::FailureHint;
 use crate::session::Session;
 use crate::verbs::{self, GcOutput, GraphFormat, Limits};
 use crate::watch::Watch;
@@ -345,8 +344,7 @@ pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
 fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Result<ExitCode> {
     let session = global.open_session()?;
     let out = options.out.clone().unwrap_or_else(|| session.pipeline.project_folder().join("out"));
-    let hint = FailureHint::new(global.plan_arguments(&plan));
-    let executor = new_executor(global.executor, options, hint, &out)?;
+    let executor = new_executor(global.executor, options, global.plan_arguments(&plan), &out)?;
     verbs::run(&session, &plan.into(), &out, executor.as_ref())
 }
 
@@ -387,19 +385,18 @@ fn positive_count(text: &str) -> Result<NonZeroUsize, String> {
     text.parse().map_err(|_| "expected a whole number of at least 1".to_owned())
 }
 
-/// Creates the executor of a run. `hint` is printed after a failure; watched views are written
-/// below `out`.
+/// Creates the executor of a run. Watched views are written below `out`.
 fn new_executor(
     kind: ExecutorKind,
     options: RunOptions,
-    hint: FailureHint,
+    plan_arguments: Vec<String>,
     out: &Path,
 ) -> Result<Box<dyn Executor>, Failure> {
     let RunOptions { jobs, threads, memory, keep_going, site, watch, .. } = options;
     if kind == ExecutorKind::Local {
         let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
         let budget = Budget::new(jobs, threads, memory.map(Memory::bytes));
-        return Ok(Box::new(Local { budget, keep_going, hint, watch }));
+        return Ok(Box::new(Local { budget, keep_going, plan_arguments, watch }));
     }
     if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
         bail_usage!(

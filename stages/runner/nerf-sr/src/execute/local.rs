@@ -17,7 +17,7 @@ use super::budget::{Admission, Budget, Demand};
 use super::node::{Lookup, NodeJob, PendingAction, input_folder};
 use crate::estimates::{check_memory, run_text, total_comparison_text};
 use crate::failure;
-use crate::run_messages::{FailureHint, end_message};
+use crate::run_messages::{command_text, end_message, failure_message};
 use crate::run_record::RunProgress;
 use crate::session::{Run, command_line};
 use crate::sink::{SinkResult, run_sink};
@@ -29,8 +29,8 @@ pub(crate) struct Local {
     pub(crate) budget: Budget,
     /// True if stages that don't depend on a failed one still run.
     pub(crate) keep_going: bool,
-    /// Message after a failure.
-    pub(crate) hint: FailureHint,
+    /// Arguments of this plan for another verb.
+    pub(crate) plan_arguments: Vec<String>,
     /// Options of `--watch`.
     pub(crate) watch: Option<Watch>,
 }
@@ -58,8 +58,8 @@ impl Executor for Local {
                 }
             }
             let node = &plan.nodes[*index];
-            let skipped = outcome.skipped;
-            report_text(&self.hint.message(&node.label(), &node.stage, skipped));
+            let log_command = self.log_command(&node.stage);
+            report_text(&failure_message(&node.label(), outcome.skipped, &log_command));
             return Ok(ExitCode::from(failure.code));
         }
         print_summaries(run, &outcome);
@@ -77,6 +77,14 @@ impl Executor for Local {
 }
 
 impl Local {
+    /// Returns the command that prints a stage's log.
+    fn log_command(&self, stage: &str) -> String {
+        let command = command_line();
+        let program = command.first().map_or("nerf-sr", String::as_str);
+        let arguments = self.plan_arguments.iter().map(String::as_str);
+        command_text([program, "log", stage].into_iter().chain(arguments))
+    }
+
     /// Runs sinks, and prints the paths of their pages and their failures.
     fn run_sinks<'a>(
         &self,

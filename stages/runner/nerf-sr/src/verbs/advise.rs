@@ -91,13 +91,14 @@ pub(crate) fn advise(
     }
     print_table(&all, processors);
     let chosen = choose(&all, limits, processors);
-    let mut words = vec!["run".to_owned()];
-    words.extend(arguments.iter().cloned());
-    words.extend(["-p".to_owned(), format!("quality={}", chosen.quality.name())]);
-    if let Some(memory) = limits.memory.filter(|memory| chosen.min_memory <= memory.bytes()) {
-        words.extend(["--memory".to_owned(), memory.to_string()]);
-    }
-    print_line!("{}", command_text(&words));
+    let quality = format!("quality={}", chosen.quality.name());
+    let memory = limits.memory.filter(|memory| chosen.min_memory <= memory.bytes());
+    let memory = memory.map(|memory| memory.to_string());
+    let mut words = vec!["nerf-sr", "run"];
+    words.extend(arguments.iter().map(String::as_str));
+    words.extend(["-p", &quality]);
+    words.extend(memory.iter().flat_map(|memory| ["--memory", memory]));
+    print_line!("{}", command_text(words));
     Ok(ExitCode::SUCCESS)
 }
 
