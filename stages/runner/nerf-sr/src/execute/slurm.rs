@@ -94,26 +94,21 @@ impl Cluster {
 fn tasks(run: &Run<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
     let plan = run.plan;
     let identities = node_identities(plan, run.store, Some(run.stop))?;
-    let mut tasks = Vec::with_capacity(plan.nodes.len() + plan.sinks.len());
-    for (index, node) in plan.nodes.iter().enumerate() {
-        tasks.push(Task {
-            stage: node.stage.clone(),
-            label: node.label(),
-            identity: identities[index].clone(),
-            parents: node.parents().collect(),
-            resources: plan.resources.get(&node.stage).cloned().unwrap_or_default(),
-        });
-    }
-    for sink in &plan.sinks {
-        tasks.push(Task {
-            stage: sink.stage.clone(),
-            label: sink.stage.clone(),
-            identity: sink_identity(sink, &identities, out),
-            parents: sink.nodes().into_iter().collect(),
-            resources: plan.resources.get(&sink.stage).cloned().unwrap_or_default(),
-        });
-    }
-    Ok(tasks)
+    let task = |stage: &str, label: String, identity: String, parents: Vec<usize>| Task {
+        stage: stage.to_owned(),
+        label,
+        identity,
+        parents,
+        resources: plan.resources.get(stage).cloned().unwrap_or_default(),
+    };
+    let nodes = plan.nodes.iter().zip(&identities).map(|(node, identity)| {
+        task(&node.stage, node.label(), identity.clone(), node.parents().collect())
+    });
+    let sinks = plan.sinks.iter().map(|sink| {
+        let identity = sink_identity(sink, &identities, out);
+        task(&sink.stage, sink.stage.clone(), identity, sink.nodes().into_iter().collect())
+    });
+    Ok(nodes.chain(sinks).collect())
 }
 
 fn sink_identity(sink: &Sink, node_identities: &[String], out: &Path) -> String {
