@@ -1,4 +1,4 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -66,8 +66,7 @@ impl Session {
         let (pipeline, targets) = planning::find_targets(&self.pipeline, &request.targets)?;
         let request = Request { targets, ..request.clone() };
         let request = stage_inputs::with_folders(&pipeline, self, &request, describing)?;
-        let plan = Plan::new(&pipeline, &self.store, &request, describing)?;
-        let plan = Plan { devices: self.devices.clone(), ..plan };
+        let plan = self.plan_of(&pipeline, &request, describing)?;
         check_not_in_input(&plan, "the store", self.store.root())?;
         for note in &plan.notes {
             report_text(note);
@@ -75,20 +74,32 @@ impl Session {
         Ok(plan)
     }
 
+    /// Creates a plan of a pipeline, without checks and notes.
+    pub(crate) fn plan_of(
+        &self,
+        pipeline: &Pipeline,
+        request: &Request,
+        describing: Describing,
+    ) -> Result<Plan, PlanError> {
+        let plan = Plan::new(pipeline, &self.store, request, describing)?;
+        Ok(Plan { devices: self.devices.clone(), ..plan })
+    }
+
     /// Finds the queued or running job of each node, and the number of this store's other jobs.
     /// Slurm is called once, and only if this store has submissions.
-    pub(crate) fn jobs(&self, plan: &Plan) -> (Vec<Option<Job>>, usize) {
+    pub(crate) fn jobs(&self, plan: &Plan) -> (BTreeMap<usize, Job>, usize) {
         let queue = Queue::read(&Slurm::default(), self.store.root()).unwrap_or_else(|error| {
             report_text(&format!("nerf-sr: cannot read the queue of jobs: {error}"));
             Queue::default()
         });
         if queue.jobs.is_empty() {
-            return (Vec::new(), 0);
+            return (BTreeMap::new(), 0);
         }
         let identities = node_identities(plan, &self.store, None).unwrap_or_default();
-        let jobs: Vec<Option<Job>> =
-            identities.iter().map(|identity| queue.find_job(identity).cloned()).collect();
-        let others = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
+        let jobs = identities.iter().map(|identity| queue.find_job(identity).cloned()).enumerate();
+        let jobs: BTreeMap<usize, Job> =
+            jobs.filter_map(|(index, job)| Some((index, job?))).collect();
+        let others = queue.jobs.len().saturating_sub(jobs.len());
         (jobs, others)
     }
 }

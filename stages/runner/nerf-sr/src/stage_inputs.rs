@@ -1,10 +1,9 @@
 //! Inputs that the command line gives by a stage's name: `-i init=train-ss` is the folder of the
 //! artifact that `train-ss` has without this argument.
 
-use artifact::known_names;
 use planning::{Describing, Pipeline, Plan, PlanError, Request, State};
 
-use crate::session::Session;
+use crate::session::{Session, nodes_of_stage};
 
 /// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts; an existing file of
 /// that name has priority. The artifact is that of the same command line, without the argument and
@@ -16,71 +15,49 @@ pub(crate) fn with_folders(
     request: &Request,
     describing: Describing<'_>,
 ) -> Result<Request, PlanError> {
+    let new_plan = |request: &Request| session.plan_of(pipeline, request, describing);
     let mut resolved = request.clone();
     for (index, input) in request.inputs.iter().enumerate() {
         let Some((name, stage)) = input.split_once('=') else { continue };
         if !pipeline.stages.contains_key(stage) || std::path::Path::new(stage).exists() {
             continue;
         }
-        let folder = folder_of(pipeline, session, &resolved, describing, (index, stage))?;
+        let mut earlier = Request { targets: vec![stage.to_owned()], ..resolved.clone() };
+        earlier.inputs.remove(index);
+        let plan = new_plan(&Request { parameters: Vec::new(), ..earlier.clone() })?;
+        let names = plan.nodes[nodes_of_stage(&plan, stage)?[0]].program.schema.names();
+        earlier.parameters.retain(|text| !is_of_stage(text, stage, &names));
+        let folder = artifact_folder(session, &new_plan(&earlier)?, stage, input)?;
         resolved.inputs[index] = format!("{name}={folder}");
     }
     Ok(resolved)
 }
 
-/// Returns the folder of a stage's artifact in the plan without the argument `index`.
-fn folder_of(
-    pipeline: &Pipeline,
+/// Returns the folder of a stage's artifact, for the argument `input`.
+fn artifact_folder(
     session: &Session,
-    request: &Request,
-    describing: Describing<'_>,
-    (index, stage): (usize, &str),
+    plan: &Plan,
+    stage: &str,
+    input: &str,
 ) -> Result<String, PlanError> {
-    let mut earlier = Request { targets: vec![stage.to_owned()], ..request.clone() };
-    earlier.inputs.remove(index);
-    let names = parameter_names(pipeline, session, &earlier, describing, stage)?;
-    earlier.parameters.retain(|text| !is_of_stage(text, stage, &names));
-    let plan = Plan::new(pipeline, &session.store, &earlier, describing)?;
-    let plan = Plan { devices: session.devices.clone(), ..plan };
     let states = plan.states(&session.store, None)?;
     let mut found = plan.nodes.iter().zip(states).filter(|(node, _)| node.stage == stage);
-    let argument = &request.inputs[index];
-    match (found.next(), found.next()) {
+    let problem = match (found.next(), found.next()) {
         (Some((_, State::Cached(record))), None) => {
-            Ok(session.store.object(&record.output).display().to_string())
+            return Ok(session.store.object(&record.output).display().to_string());
         }
-        (Some(_), None) => Err(PlanError::Usage(format!(
-            "-i {argument}: {stage} has no artifact yet; run it first: nerf-sr run {stage}"
-        ))),
-        _ => Err(PlanError::Usage(format!(
-            "-i {argument}: {stage} has several points; name the folder of one (`nerf-sr path`)"
-        ))),
-    }
-}
-
-/// Returns the names of a stage's parameters.
-fn parameter_names(
-    pipeline: &Pipeline,
-    session: &Session,
-    request: &Request,
-    describing: Describing<'_>,
-    stage: &str,
-) -> Result<Vec<String>, PlanError> {
-    let request = Request { parameters: Vec::new(), ..request.clone() };
-    let plan = Plan::new(pipeline, &session.store, &request, describing)?;
-    let node = plan.nodes.iter().find(|node| node.stage == stage).ok_or_else(|| {
-        let stages = plan.nodes.iter().map(|node| node.stage.as_str());
-        PlanError::Usage(format!("{stage} has no artifact; {}", known_names(stage, stages)))
-    })?;
-    Ok(node.program.schema.names().into_iter().map(str::to_owned).collect())
+        (Some(_), None) => format!("has no artifact yet; run it first: nerf-sr run {stage}"),
+        _ => "has several points; name the folder of one (`nerf-sr path`)".to_owned(),
+    };
+    Err(PlanError::Usage(format!("-i {input}: {stage} {problem}")))
 }
 
 /// True if an argument of `-p` sets a parameter of the stage.
-fn is_of_stage(text: &str, stage: &str, names: &[String]) -> bool {
+fn is_of_stage(text: &str, stage: &str, names: &[&str]) -> bool {
     let name = text.split('=').next().unwrap_or_default();
     match name.strip_prefix(stage).and_then(|rest| rest.strip_prefix('.')) {
         Some(_) => true,
-        None => names.iter().any(|own| own == name),
+        None => names.contains(&name),
     }
 }
 
@@ -90,7 +67,7 @@ mod tests {
 
     #[test]
     fn arguments_are_matched_to_their_stage() {
-        let names = ["rays".to_owned(), "seed".to_owned()];
+        let names = ["rays", "seed"];
         for (text, expected) in [
             ("rays=30M", true),
             ("train-ss.rays=1,2", true),

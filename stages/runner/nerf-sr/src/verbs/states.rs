@@ -79,17 +79,17 @@ pub(crate) fn why(
 /// Prints every stage with its artifact, age and running time.
 pub(crate) fn status(session: &Session, request: &Request, json: bool) -> anyhow::Result<ExitCode> {
     let (plan, states) = session.plan_with_states(request)?;
-    let (mut jobs, other_jobs) = session.jobs(&plan);
-    jobs.resize(plan.nodes.len(), None);
+    let (jobs, other_jobs) = session.jobs(&plan);
     if json {
         let mut report = PlanReport::new(session, &plan, &states, &[])?;
-        for (index, job) in jobs.into_iter().enumerate() {
-            report.nodes[index].job = job;
+        for (index, job) in jobs {
+            report.nodes[index].job = Some(job);
         }
         return print_json(&report);
     }
     for (index, state) in states.iter().enumerate() {
-        let mut details: Vec<String> = jobs[index].iter().map(ToString::to_string).collect();
+        let mut details: Vec<String> =
+            jobs.get(&index).map(ToString::to_string).into_iter().collect();
         match state {
             State::Cached(record) => details.push(cached_detail(session, record)),
             State::WillRun { key_parts }
