@@ -1,4 +1,5 @@
-use std::path::{Path, PathBuf};
+use std::fs::Metadata;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::UNIX_EPOCH;
 
@@ -91,28 +92,22 @@ fn unfinished_log(store: &Store, key: &str) -> PathBuf {
 }
 
 /// Finds the log of a stage's last run, finished or not, with any arguments. Returns the time of
-/// its end or last output, in seconds since 1970, and the log.
+/// its last output, in seconds since 1970, and the log.
 fn find_last_log(store: &Store, stage: &str) -> Result<Option<(u64, NodeLog)>, StoreError> {
-    let mut logs = Vec::new();
-    for record in store.records()?.into_iter().filter(|record| record.stage == stage) {
-        let ended_unix = record.started_unix + record.seconds as u64;
-        let path = store.action(&record.key(), "log");
-        logs.push((ended_unix, NodeLog { label: label(&record.stage, &record.point), path }));
+    let mut actions = Vec::new();
+    for record in store.records()? {
+        actions.push((store.action(&record.key(), "log"), record.stage, record.point));
     }
     for key in store.partials()? {
-        let path = unfinished_log(store, &key);
-        if let Some(action) = store.unfinished(&key)?.filter(|action| action.stage == stage)
-            && let Some(unix) = modified_unix(&path)
-        {
-            logs.push((unix, NodeLog { label: label(&action.stage, &action.point), path }));
+        if let Some(action) = store.unfinished(&key)? {
+            actions.push((unfinished_log(store, &key), action.stage, action.point));
         }
     }
-    logs.retain(|(_, log)| log.path.is_file());
-    Ok(logs.into_iter().max_by_key(|(unix, _)| *unix))
-}
-
-/// Returns a file's modification time in seconds since 1970; `None` if unknown.
-fn modified_unix(path: &Path) -> Option<u64> {
-    let time = std::fs::metadata(path).ok()?.modified().ok()?;
-    Some(time.duration_since(UNIX_EPOCH).ok()?.as_secs())
+    actions.retain(|(_, other, _)| other == stage);
+    let logs = actions.into_iter().filter_map(|(path, stage, point)| {
+        let time = path.metadata().ok().filter(Metadata::is_file)?.modified().ok()?;
+        let unix = time.duration_since(UNIX_EPOCH).ok()?.as_secs();
+        Some((unix, NodeLog { label: label(&stage, &point), path }))
+    });
+    Ok(logs.max_by_key(|(unix, _)| *unix))
 }

@@ -55,30 +55,26 @@ impl Verification<'_> {
     /// Hashes an object again. Garbage collection may delete the object meanwhile, so a problem
     /// counts only if the object still exists after entering the store.
     fn check_object(&mut self, identity: &str) -> anyhow::Result<()> {
-        let store = self.store;
-        if store.verify(identity).is_ok() {
-            self.tally.artifacts += 1;
-            return Ok(());
-        }
-        let _entered = self.enter()?;
-        if is_deleted(&store.object(identity)) {
-            return Ok(());
+        let mut result = self.store.verify(identity);
+        let _entered;
+        if result.is_err() {
+            _entered = self.enter()?;
+            if is_deleted(&self.store.object(identity)) {
+                return Ok(());
+            }
+            result = self.store.verify(identity);
         }
         self.tally.artifacts += 1;
-        match store.verify(identity) {
-            Ok(()) => {}
-            Err(problem @ Damage::Unreadable { .. }) => {
-                self.tally.unreadable += 1;
-                self.print(&problem);
-            }
-            Err(damage) => {
-                self.tally.damaged_artifacts += 1;
-                self.print(&damage);
-                if self.remove {
-                    store.remove_object(identity)?;
-                    self.print(&REMOVED_NOTE);
-                }
-            }
+        let Err(problem) = result else { return Ok(()) };
+        self.print(&problem);
+        if matches!(problem, Damage::Unreadable { .. }) {
+            self.tally.unreadable += 1;
+            return Ok(());
+        }
+        self.tally.damaged_artifacts += 1;
+        if self.remove {
+            self.store.remove_object(identity)?;
+            self.print(&REMOVED_NOTE);
         }
         Ok(())
     }
