@@ -61,20 +61,21 @@ pub fn main() -> ExitCode {
     stage::install_panic_hook("nerf-sr");
     cli::run_command_line().unwrap_or_else(|error| {
         report_line!("nerf-sr: {}", artifact::one_line(&error));
-        let plan_error = error.chain().find_map(|e| e.downcast_ref::<PlanError>());
-        let stage_failure = error.chain().find_map(|e| e.downcast_ref::<StageFailure>());
-        let code = plan_error.map(plan_exit_code).or(stage_failure.map(|failure| failure.code));
-        ExitCode::from(code.unwrap_or_else(|| artifact::exit_code(&error)))
+        ExitCode::from(exit_code(&error))
     })
 }
 
-/// Returns a failure with exit code 1.
-fn failure(error: impl std::fmt::Display) -> StageFailure {
-    failure_with(StageFailure::FAILED, error)
+/// Returns the exit code of an error, by the first cause that has one.
+fn exit_code(error: &anyhow::Error) -> u8 {
+    let plan_error = error.chain().find_map(|e| e.downcast_ref::<PlanError>());
+    let stage_failure = error.chain().find_map(|e| e.downcast_ref::<StageFailure>());
+    let code = plan_error.map(plan_exit_code).or(stage_failure.map(|failure| failure.code));
+    code.unwrap_or_else(|| artifact::exit_code(error))
 }
 
-fn failure_with(code: u8, error: impl std::fmt::Display) -> StageFailure {
-    StageFailure { code, message: error.to_string() }
+/// Converts an error to the failure of a stage.
+fn stage_failure(error: &anyhow::Error) -> StageFailure {
+    StageFailure { code: exit_code(error), message: artifact::one_line(error) }
 }
 
 fn plan_exit_code(error: &PlanError) -> u8 {

@@ -16,13 +16,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use anyhow::{Context as _, anyhow};
 use artifact::{Manifest, list_files};
-use planning::stage_call::StageFailure;
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 use store::{Locked, StoreError, is_lock_acquired};
 
 use crate::archive::archive_path;
-use crate::failure;
 use crate::page::{PageMark, check_ownership};
 use crate::waiting::wait_for_lock;
 
@@ -47,17 +46,18 @@ pub(crate) fn publish(
     target: &Path,
     kind: &str,
     stop: &AtomicBool,
-) -> Result<Vec<PathBuf>, StageFailure> {
+) -> anyhow::Result<Vec<PathBuf>> {
     let out = target.parent().unwrap_or(Path::new("."));
-    fs::create_dir_all(out).map_err(|e| StageFailure::at(out, &e))?;
+    fs::create_dir_all(out).with_context(|| out.display().to_string())?;
     let _lock = lock_folder(out, stop)?;
-    let mark = PageMark::read(output).map_err(|e| StageFailure::at(output, &e))?;
+    let mark = PageMark::read(output).with_context(|| output.display().to_string())?;
     let publishing = Publishing { target, kind, mark: mark.unwrap_or_default() };
-    let mut archived = publishing.finish_earlier()?;
-    let replaced = publishing.replace(output);
+    let result = publishing.run(output);
     remove_folder(&publishing.hidden("scrap")).ok();
-    archived.extend(replaced?);
-    Ok(archived)
+    // Other errors name their files.
+    result.map_err(|error| {
+        if error.is::<io::Error>() { error.context(target.display().to_string()) } else { error }
+    })
 }
 
 /// A publishing in progress; the target's parent folder is locked.
@@ -73,24 +73,24 @@ impl Publishing<'_> {
         hidden(self.target, suffix)
     }
 
-    fn failure(&self, error: &io::Error) -> StageFailure {
-        StageFailure::at(self.target, error)
+    /// Publishes the output. Returns the new paths of earlier pages that were archived.
+    fn run(&self, output: &Path) -> anyhow::Result<Vec<PathBuf>> {
+        let mut archived = self.finish_earlier()?;
+        archived.extend(self.replace(output)?);
+        Ok(archived)
     }
 
     /// Finishes a killed publishing. Returns the new paths of its pages that were archived.
-    fn finish_earlier(&self) -> Result<Vec<PathBuf>, StageFailure> {
+    fn finish_earlier(&self) -> anyhow::Result<Vec<PathBuf>> {
         let (old, new) = (self.hidden("old"), self.hidden("new"));
-        let is_target_missing = !exists(self.target).map_err(|e| self.failure(&e))?;
-        if is_target_missing && exists(&old).map_err(|e| self.failure(&e))? {
-            fs::rename(&old, self.target).map_err(|e| self.failure(&e))?;
+        if !exists(self.target)? && exists(&old)? {
+            fs::rename(&old, self.target)?;
         }
         let mut archived = Vec::new();
         for leftover in [old, new] {
-            if exists(&leftover).map_err(|e| self.failure(&e))? {
+            if exists(&leftover)? {
                 self.check_ownership(&leftover)?;
-                archived.extend(
-                    self.archive_or_delete_leftover(&leftover).map_err(|e| self.failure(&e))?,
-                );
+                archived.extend(self.archive_or_delete_leftover(&leftover)?);
             }
         }
         Ok(archived)
@@ -110,25 +110,24 @@ impl Publishing<'_> {
 
     /// Replaces the target's page by a copy of `output`. Returns the new path of the old page if
     /// that was archived.
-    fn replace(&self, output: &Path) -> Result<Option<PathBuf>, StageFailure> {
+    fn replace(&self, output: &Path) -> anyhow::Result<Option<PathBuf>> {
         let (scrap, staged) = (self.hidden("scrap"), self.hidden("new"));
-        remove_folder(&scrap)
-            .and_then(|()| copy_folder(output, &scrap))
-            .and_then(|()| fs::rename(&scrap, &staged))
-            .map_err(|e| StageFailure::at(&scrap, &e))?;
+        remove_folder(&scrap)?;
+        copy_folder(output, &scrap)?;
+        fs::rename(&scrap, &staged)?;
         if let Err(refused) = self.exchange(&staged) {
             self.delete(&staged).ok();
             return Err(refused);
         }
         // After the exchange the old page is there, if one existed.
         let replaced = staged;
-        self.archive_or_delete(&replaced, &self.mark).map_err(|e| StageFailure::at(&replaced, &e))
+        Ok(self.archive_or_delete(&replaced, &self.mark)?)
     }
 
     /// Exchanges a page and the target's page. If the target doesn't exist, the page is moved.
-    fn exchange(&self, page: &Path) -> Result<(), StageFailure> {
-        if !exists(self.target).map_err(|e| self.failure(&e))? {
-            return fs::rename(page, self.target).map_err(|e| self.failure(&e));
+    fn exchange(&self, page: &Path) -> anyhow::Result<()> {
+        if !exists(self.target)? {
+            return Ok(fs::rename(page, self.target)?);
         }
         self.check_ownership(self.target)?;
         let flags = RenameFlags::EXCHANGE;
@@ -138,10 +137,10 @@ impl Publishing<'_> {
         // Not every file system can exchange two folders. Without that, the target doesn't exist
         // for a moment.
         let old = self.hidden("old");
-        self.move_page(self.target, &old).map_err(|e| self.failure(&e))?;
+        self.move_page(self.target, &old)?;
         let moved = fs::rename(page, self.target);
         let destination = if moved.is_ok() { page } else { self.target };
-        fs::rename(&old, destination).and(moved).map_err(|e| self.failure(&e))
+        Ok(fs::rename(&old, destination).and(moved)?)
     }
 
     /// Archives a page that one with the mark `newer` replaces, or deletes it if it isn't worth
@@ -186,12 +185,12 @@ impl Publishing<'_> {
         }
     }
 
-    fn check_ownership(&self, folder: &Path) -> Result<(), StageFailure> {
+    fn check_ownership(&self, folder: &Path) -> anyhow::Result<()> {
         check_ownership(folder, self.kind).map_err(|reason| {
-            failure(format!(
+            anyhow!(
                 "{reason}; nothing was replaced: move that file or folder away, or choose another \
                 folder with --out"
-            ))
+            )
         })
     }
 }
@@ -204,7 +203,7 @@ fn hidden(target: &Path, suffix: &str) -> PathBuf {
 
 /// Locks a folder of pages. Runs with different stores may publish into the same folder, so the
 /// store's locks aren't enough.
-fn lock_folder(folder: &Path, stop: &AtomicBool) -> Result<File, StageFailure> {
+fn lock_folder(folder: &Path, stop: &AtomicBool) -> anyhow::Result<File> {
     wait_for_lock(stop, &|_, _| {}, || {
         let file = File::open(folder)
             .map_err(|source| StoreError::Io { path: folder.to_path_buf(), source })?;

@@ -13,7 +13,6 @@ use planning::{Sink, environment_parts};
 use serde_json::{Map, Value, json};
 use store::{Record, StoreError};
 
-use crate::failure;
 use crate::page::PageMark;
 use crate::publish::{has_current_page, publish};
 use crate::run_record::{RunProgress, add_details, run_record, shown_results};
@@ -110,7 +109,7 @@ pub(crate) fn run_sink(
     sink: &Sink,
     threads: usize,
     progress: &RunProgress<'_>,
-) -> Result<SinkResult, StageFailure> {
+) -> anyhow::Result<SinkResult> {
     let Some((mut record, indices)) = run_record(run, sink, progress) else {
         return Ok(SinkResult::Incomplete);
     };
@@ -126,9 +125,9 @@ pub(crate) fn run_sink(
         call(run, sink, threads, &record, &scratch, &output)
     })?;
     if output.symlink_metadata().is_err() {
-        return Err(failure(StoreError::missing_output()));
+        return Err(StoreError::missing_output().into());
     }
-    list_output_files(&output).map_err(failure)?;
+    list_output_files(&output)?;
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
     if !manifest.exists() {
@@ -153,7 +152,7 @@ fn call(
     record: &RunRecord,
     scratch: &Path,
     output: &Path,
-) -> Result<(), StageFailure> {
+) -> anyhow::Result<()> {
     let folder = scratch.join("run");
     let params = scratch.join("params.json");
     std::fs::create_dir_all(&folder)
@@ -178,7 +177,8 @@ fn call(
     };
     let result = call.run(&scratch.join("log"), &view, run.stop);
     view.end();
-    result.map(drop)
+    result?;
+    Ok(())
 }
 
 #[cfg(test)]

@@ -3,19 +3,14 @@
 //! checks.
 
 use std::collections::BTreeMap;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{Damage, MANIFEST_FILE, Manifest, write_atomically};
-use planning::stage_call::StageFailure;
+use artifact::{Damage, Failure, MANIFEST_FILE, Manifest, write_atomically};
 use planning::{
-    ConfirmError, HashedInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp,
-    read_source,
+    ConfirmError, HashedInputs, Node, NodeInput, Origin, Source, StageProgram, Stamp, read_source,
 };
 use store::{Attempt, Store};
-
-use crate::{failure, failure_with, plan_exit_code};
 
 /// Calls a program if it is the planned one, and fails if it was changed until its end. Only a
 /// second signal interrupts the latter check: the first one must not cost a result.
@@ -23,23 +18,19 @@ pub(crate) fn call_confirmed<T>(
     program: &StageProgram,
     store: &Store,
     stop: &AtomicBool,
-    call: impl FnOnce() -> Result<T, StageFailure>,
-) -> Result<T, StageFailure> {
-    let start = program.confirm(store, Some(stop)).map_err(|e| confirmation_failure(&e))?;
+    call: impl FnOnce() -> anyhow::Result<T>,
+) -> anyhow::Result<T> {
+    let start = program.confirm(store, Some(stop)).map_err(confirmation_failure)?;
     let result = call()?;
-    program.confirm_since(&start, store, None).map_err(|e| confirmation_failure(&e))?;
+    program.confirm_since(&start, store, None).map_err(confirmation_failure)?;
     Ok(result)
 }
 
-fn confirmation_failure(problem: &ConfirmError) -> StageFailure {
-    let is_interrupted = matches!(problem, ConfirmError::Interrupted);
-    let code = if is_interrupted { StageFailure::INTERRUPTED } else { StageFailure::USAGE };
-    failure_with(code, problem)
-}
-
-/// Returns the failure of a stage whose inputs can't be used.
-pub(crate) fn input_failure(problem: &PlanError) -> StageFailure {
-    failure_with(plan_exit_code(problem), problem)
+fn confirmation_failure(problem: ConfirmError) -> Failure {
+    match problem {
+        ConfirmError::Program(problem) => Failure::Usage(problem.to_string()),
+        ConfirmError::Interrupted => Failure::Interrupted,
+    }
 }
 
 /// Inputs of a node, as they were when the key was computed.
@@ -60,7 +51,7 @@ impl<'a> Inputs<'a> {
         store: &'a Store,
         found: HashedInputs,
         output_of: impl Fn(usize) -> String,
-    ) -> Result<Self, StageFailure> {
+    ) -> Result<Self, Failure> {
         let mut artifacts = Vec::new();
         for input in &node.inputs {
             if let Origin::Node { index, subtree } = &input.from {
@@ -80,39 +71,38 @@ impl<'a> Inputs<'a> {
     }
 
     /// Fails if an input was changed since its content was hashed.
-    pub(crate) fn check(&self, stop: &AtomicBool) -> Result<(), StageFailure> {
-        self.find_change(Some(stop))?.map_or(Ok(()), Err)
+    pub(crate) fn check(&self, stop: &AtomicBool) -> anyhow::Result<()> {
+        Ok(self.find_change(Some(stop))?.map_or(Ok(()), Err)?)
     }
 
     /// Checks the inputs like [`Self::check`] after the stage's end. If an input was changed,
     /// removes the attempt's checkpoints: they may contain the changed input, even if it gets its
     /// old content back. Only a second signal interrupts this: the first one must not cost a
     /// result.
-    pub(crate) fn check_again(&self, attempt: &Attempt) -> Result<(), StageFailure> {
+    pub(crate) fn check_again(&self, attempt: &Attempt) -> anyhow::Result<()> {
         let Some(change) = self.find_change(None)? else { return Ok(()) };
-        attempt.remove_checkpoints().map_err(failure)?;
-        Err(change)
+        attempt.remove_checkpoints()?;
+        Err(change.into())
     }
 
     /// Returns the failure for an input that was changed since its content was hashed. Fails if an
     /// input can't be compared: an unreadable one may be unchanged.
-    fn find_change(&self, stop: Option<&AtomicBool>) -> Result<Option<StageFailure>, StageFailure> {
+    fn find_change(&self, stop: Option<&AtomicBool>) -> anyhow::Result<Option<Failure>> {
         for NodeInput { name, from } in &self.node.inputs {
             let Origin::Folder(folder) = from else { continue };
-            let now = read_source(self.store, self.node, name, folder, stop)
-                .map_err(|e| input_failure(&e))?;
+            let now = read_source(self.store, self.node, name, folder, stop)?;
             if let Some(change) = now.change_since(&self.sources[name]) {
                 let problem = format!(
                     "input {name} ({}): {change} since it was hashed, so no result is recorded; \
                     run again",
                     folder.display()
                 );
-                return Ok(Some(failure_with(StageFailure::BAD_INPUT, problem)));
+                return Ok(Some(Failure::BadInput(problem)));
             }
         }
         match self.artifacts.iter().try_for_each(StoredInput::check) {
             Ok(()) => Ok(None),
-            Err(unreadable @ Damage::Unreadable { .. }) => Err(damage_failure(&unreadable)),
+            Err(unreadable @ Damage::Unreadable { .. }) => Err(damage_failure(&unreadable).into()),
             Err(damage) => Ok(Some(damage_failure(&damage))),
         }
     }
@@ -120,7 +110,7 @@ impl<'a> Inputs<'a> {
     /// Removes checkpoints of an earlier attempt if a folder outside the store was written to since
     /// that attempt began: the content is the same now, but the attempt may have read other
     /// content. Returns whether checkpoints were removed.
-    pub(crate) fn drop_doubtful_checkpoints(&self, attempt: &Attempt) -> io::Result<bool> {
+    pub(crate) fn drop_doubtful_checkpoints(&self, attempt: &Attempt) -> anyhow::Result<bool> {
         let sources = self.sources.iter();
         let times: BTreeMap<String, String> =
             sources.map(|(name, source)| (name.clone(), source.times_hash())).collect();
@@ -135,15 +125,15 @@ impl<'a> Inputs<'a> {
         }
         let is_doubtful = earlier.is_some() && attempt.work.exists();
         if is_doubtful {
-            attempt.remove_checkpoints().map_err(io::Error::other)?;
+            attempt.remove_checkpoints()?;
         }
         write_atomically(&file, serde_json::to_string(&times)?.as_bytes())?;
         Ok(is_doubtful)
     }
 }
 
-fn damage_failure(damage: &Damage) -> StageFailure {
-    failure_with(StageFailure::BAD_INPUT, damage)
+fn damage_failure(damage: &Damage) -> Failure {
+    Failure::BadInput(damage.to_string())
 }
 
 /// An input from the store.
@@ -233,11 +223,11 @@ mod tests {
         let before = inputs(&node, &store);
         before.check_again(&attempt).unwrap();
         fs::rename(&data, &away).unwrap();
-        let message = before.check_again(&attempt).unwrap_err().message;
+        let message = before.check_again(&attempt).unwrap_err().to_string();
         assert!(message.contains("no such folder") && attempt.work.exists(), "{message}");
         fs::rename(&away, &data).unwrap();
         fs::write(data.join("x"), "2").unwrap();
-        let message = before.check_again(&attempt).unwrap_err().message;
+        let message = before.check_again(&attempt).unwrap_err().to_string();
         assert!(message.contains("x was changed") && !attempt.work.exists(), "{message}");
     }
 

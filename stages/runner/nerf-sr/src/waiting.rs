@@ -4,10 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{Failure, format_duration};
-use planning::stage_call::StageFailure;
 use store::{Entered, Holder, Locked, Store, StoreError, host_name};
-
-use crate::{failure, failure_with};
 
 /// Interval between two attempts to lock; chosen by hand.
 const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
@@ -21,15 +18,15 @@ pub(crate) fn wait_for_lock<T>(
     stop: &AtomicBool,
     report: &dyn Fn(Option<&Holder>, Duration),
     mut attempt: impl FnMut() -> Result<Locked<T>, StoreError>,
-) -> Result<T, StageFailure> {
+) -> anyhow::Result<T> {
     let begin = Instant::now();
     let mut next_notice = NOTICE_DELAY;
     loop {
-        match attempt().map_err(failure)? {
+        match attempt()? {
             Locked::Acquired(held) => return Ok(held),
             Locked::HeldBy(holder) => {
                 if stop.load(Ordering::Relaxed) {
-                    return Err(failure_with(StageFailure::INTERRUPTED, Failure::Interrupted));
+                    return Err(Failure::Interrupted.into());
                 }
                 if begin.elapsed() >= next_notice {
                     report(holder.as_ref(), begin.elapsed());
@@ -46,7 +43,7 @@ pub(crate) fn enter_store(
     store: &Store,
     stop: &AtomicBool,
     report: &dyn Fn(&str),
-) -> Result<Entered, StageFailure> {
+) -> anyhow::Result<Entered> {
     wait_for_lock(
         stop,
         &|holder, waited| {
@@ -103,7 +100,7 @@ mod tests {
             stop.store(true, Ordering::Relaxed);
         };
         let failure = wait_for_lock(&stop, &report, || store.try_lock("k")).unwrap_err();
-        assert_eq!(failure.code, 130);
+        assert_eq!(crate::exit_code(&failure), 130);
         assert_eq!(reports.into_inner(), [format!(" by process {}", std::process::id())]);
     }
 

@@ -16,11 +16,11 @@ use super::Executor;
 use super::budget::{Admission, Budget, Demand};
 use super::node::{Lookup, NodeJob, PendingAction, input_folder};
 use crate::estimates::{check_memory, run_text, total_comparison_text};
-use crate::failure;
 use crate::run_messages::{command_text, end_message, failure_message};
 use crate::run_record::RunProgress;
 use crate::session::{Run, command_line};
 use crate::sink::{SinkResult, run_sink};
+use crate::stage_failure;
 use crate::watch::{Chain, Watch};
 
 /// This machine.
@@ -109,9 +109,10 @@ impl Local {
                     result.print(&sink.stage);
                     sinks_outcome.has_written |= matches!(result, SinkResult::Written { .. });
                 }
-                Err(failure) => {
-                    report_line!("nerf-sr: {}: {failure}", sink.stage);
-                    sinks_outcome.first_failure.get_or_insert(failure.code);
+                Err(error) => {
+                    let StageFailure { code, message } = stage_failure(&error);
+                    report_line!("nerf-sr: {}: {message}", sink.stage);
+                    sinks_outcome.first_failure.get_or_insert(code);
                 }
             }
         }
@@ -141,7 +142,7 @@ struct Outcome {
 }
 
 /// Report of a worker: the node, its record, and whether the stage ran.
-type WorkerReport = (usize, Result<(Record, bool), StageFailure>);
+type WorkerReport = (usize, anyhow::Result<(Record, bool)>);
 
 fn run_nodes(run: &Run<'_>, options: &Local) -> Outcome {
     let display = Display::new();
@@ -273,7 +274,7 @@ impl<'a> Schedule<'a> {
                     let demand = Demand::estimate(&action.key_parts, &node.stage, records);
                     self.ready.insert(index, ReadyNode { action, demand, is_reported: false });
                 }
-                Err(failure) => self.fail(index, failure),
+                Err(error) => self.fail(index, &error),
             }
         }
     }
@@ -290,7 +291,7 @@ impl<'a> Schedule<'a> {
                     continue;
                 }
                 Admission::TooLarge(message) if !self.is_stopping() => {
-                    self.fail(index, failure(message));
+                    self.fail(index, &anyhow::Error::msg(message));
                     continue;
                 }
                 Admission::WaitForMemory(reason) if !node.is_reported => {
@@ -314,11 +315,12 @@ impl<'a> Schedule<'a> {
                     self.outcome.ran.insert(index);
                 }
             }
-            Err(failure) => self.fail(index, failure),
+            Err(error) => self.fail(index, &error),
         }
     }
 
-    fn fail(&mut self, index: usize, failure: StageFailure) {
+    fn fail(&mut self, index: usize, error: &anyhow::Error) {
+        let failure = stage_failure(error);
         // A stage that was interrupted has not failed.
         let failed = if failure.code == Failure::Interrupted.exit_code() { "" } else { "failed: " };
         self.report(index, &format!("{failed}{}", failure.message));

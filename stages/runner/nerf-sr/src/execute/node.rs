@@ -12,9 +12,8 @@ use serde_json::{Map, Value};
 use store::{Attempt, Entered, Holder, KeyLock, Record, Store, TimeSpent, Unfinished, host_name};
 
 use crate::estimates::{Estimate, comparison_text};
-use crate::failure;
 use crate::session::Run;
-use crate::unchanged::{Inputs, call_confirmed, input_failure};
+use crate::unchanged::{Inputs, call_confirmed};
 use crate::waiting::{enter_store, holder_text, wait_for_lock};
 use crate::watch::{Chain, Watch, Watching, scratch_name};
 
@@ -47,7 +46,7 @@ pub(crate) struct NodeJob<'a> {
 
 impl NodeJob<'_> {
     /// Returns the node's record, after running the node if it isn't cached.
-    pub(crate) fn find_or_run(&self) -> Result<Record, StageFailure> {
+    pub(crate) fn find_or_run(&self) -> anyhow::Result<Record> {
         match self.look_up()? {
             Lookup::Cached(record) => Ok(record),
             Lookup::Pending(pending) => self.carry_out(pending).map(|(record, _)| record),
@@ -56,16 +55,15 @@ impl NodeJob<'_> {
 
     /// Looks up the node's record. Cached or not, the node's key is first written to the run's
     /// file, which protects the artifact from garbage collection.
-    pub(crate) fn look_up(&self) -> Result<Lookup, StageFailure> {
+    pub(crate) fn look_up(&self) -> anyhow::Result<Lookup> {
         let inputs = hash_inputs(self.node, self.run.store, Some(self.run.stop), |index| {
             self.output_of(index)
-        })
-        .map_err(|e| input_failure(&e))?;
+        })?;
         let key_parts = planning::key_parts(self.node, &inputs.hashes, self.device());
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
-        self.run.file.record_action(&entered, &self.node.stage, &key).map_err(failure)?;
-        Ok(match self.run.store.hit(&key).map_err(failure)? {
+        self.run.file.record_action(&entered, &self.node.stage, &key)?;
+        Ok(match self.run.store.hit(&key)? {
             Some(record) => Lookup::Cached(record),
             None => Lookup::Pending(PendingAction { key, key_parts, inputs }),
         })
@@ -73,14 +71,14 @@ impl NodeJob<'_> {
 
     /// Runs the node unless another runner has done so meanwhile. Returns the record and whether
     /// the stage ran.
-    pub(crate) fn carry_out(&self, pending: PendingAction) -> Result<(Record, bool), StageFailure> {
+    pub(crate) fn carry_out(&self, pending: PendingAction) -> anyhow::Result<(Record, bool)> {
         let PendingAction { key, key_parts, inputs } = pending;
         let lock = wait_for_lock(
             self.run.stop,
             &|holder, waited| self.report_waiting(holder, waited),
             || self.run.store.try_lock(&key),
         )?;
-        let stored = stored_inputs([self.node], self.run.store).map_err(failure)?;
+        let stored = stored_inputs([self.node], self.run.store)?;
         let action = Unfinished {
             stage: self.node.stage.clone(),
             point: self.node.point.clone(),
@@ -91,11 +89,11 @@ impl NodeJob<'_> {
         let attempt = {
             let entered = self.enter()?;
             let kind = &self.node.program.description.output.kind;
-            let record = self.run.store.hit_or_repair(&entered, &key, kind).map_err(failure)?;
+            let record = self.run.store.hit_or_repair(&entered, &key, kind)?;
             if let Some(record) = record {
                 return Ok((record, false));
             }
-            self.run.store.begin(&entered, &action, &self.node.parameters).map_err(failure)?
+            self.run.store.begin(&entered, &action, &self.node.parameters)?
         };
         let inputs = Inputs::new(self.node, self.run.store, inputs, |index| self.output_of(index))?;
         self.run_and_publish(&lock, attempt, action, &inputs).map(|record| (record, true))
@@ -113,7 +111,7 @@ impl NodeJob<'_> {
         self.display.line(&format!("{}: {text}", self.node.label()));
     }
 
-    fn enter(&self) -> Result<Entered, StageFailure> {
+    fn enter(&self) -> anyhow::Result<Entered> {
         enter_store(self.run.store, self.run.stop, &|text| self.report(text))
     }
 
@@ -129,7 +127,7 @@ impl NodeJob<'_> {
         attempt: Attempt,
         action: Unfinished,
         inputs: &Inputs<'_>,
-    ) -> Result<Record, StageFailure> {
+    ) -> anyhow::Result<Record> {
         let store = self.run.store;
         let (peak_memory, time) = call_confirmed(&self.node.program, store, self.run.stop, || {
             self.call(lock, &attempt, inputs)
@@ -151,8 +149,8 @@ impl NodeJob<'_> {
             summary: read_summary(&attempt.output),
         };
         let kind = &self.node.program.description.output.kind;
-        let checked = store.check(attempt, kind).map_err(failure)?;
-        let record = store.publish(&self.enter()?, checked, record).map_err(failure)?;
+        let checked = store.check(attempt, kind)?;
+        let record = store.publish(&self.enter()?, checked, record)?;
         let estimate = self.estimate.and_then(|estimate| comparison_text(&estimate, &record));
         self.report(&format!(
             "done in {}, artifact {}{}",
@@ -170,10 +168,10 @@ impl NodeJob<'_> {
         lock: &KeyLock,
         attempt: &Attempt,
         inputs: &Inputs<'_>,
-    ) -> Result<(u64, TimeSpent), StageFailure> {
+    ) -> anyhow::Result<(u64, TimeSpent)> {
         let label = self.node.label();
         inputs.check(self.run.stop)?;
-        if inputs.drop_doubtful_checkpoints(attempt).map_err(failure)? {
+        if inputs.drop_doubtful_checkpoints(attempt)? {
             self.report("an input was written to after the checkpoint; starting over");
         }
         let mut folders: Vec<(String, PathBuf)> = Vec::new();
@@ -207,7 +205,8 @@ impl NodeJob<'_> {
         stage_display.end();
         // Without the file, only the record's time is too short.
         attempt.record_time_spent(&time).ok();
-        result.map(|()| (usage.peak_memory, time))
+        result?;
+        Ok((usage.peak_memory, time))
     }
 
     /// Runs the stage. If the node is watched, a second thread takes looks until the stage ends.

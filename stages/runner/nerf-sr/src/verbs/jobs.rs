@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
-use artifact::{format_count, print_line, report_line, report_text};
+use artifact::{bail_bad_input, format_count, print_line, report_line};
 use planning::stage_call::{Display, StageFailure, stop_on_signals};
 use planning::{FrozenPlan, Plan, State};
 use signal_hook::consts::SIGUSR1;
@@ -16,11 +16,10 @@ use store::{Record, Store};
 use super::run::begin_run;
 use crate::estimates::Estimates;
 use crate::execute::NodeJob;
-use crate::failure_with;
 use crate::run_record::RunProgress;
 use crate::session::Run;
 use crate::sink::run_sink;
-use crate::unchanged::input_failure;
+use crate::stage_failure;
 
 /// Cancels the jobs of this store, or those of one stage. Slurm also cancels the jobs that depend
 /// on them.
@@ -61,12 +60,13 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
         file.end().ok();
         result
     });
-    let Err(failure) = result else { return Ok(ExitCode::SUCCESS) };
-    report_text(&format!("nerf-sr: {}", failure.message));
-    if is_time_up.load(Ordering::Relaxed) && failure.code == StageFailure::INTERRUPTED {
+    let Err(error) = result else { return Ok(ExitCode::SUCCESS) };
+    let StageFailure { code, message } = stage_failure(&error);
+    report_line!("nerf-sr: {message}");
+    if is_time_up.load(Ordering::Relaxed) && code == StageFailure::INTERRUPTED {
         requeue(&plan, &store)?;
     }
-    Ok(ExitCode::from(failure.code))
+    Ok(ExitCode::from(code))
 }
 
 /// Returns the command line of the run that wrote a submission; empty if the run's file was
@@ -99,8 +99,8 @@ fn requeue(plan: &Plan, store: &Store) -> anyhow::Result<()> {
 
 /// Runs the task of a plan for one job. `command` is the command line of the run that submitted the
 /// task.
-fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
-    let states = run.plan.states(run.store, Some(run.stop)).map_err(|e| input_failure(&e))?;
+fn run_task(run: &Run<'_>, command: &[String]) -> anyhow::Result<()> {
+    let states = run.plan.states(run.store, Some(run.stop))?;
     let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
     let threads = stage::processors().count;
     stage::start_threads(threads);
@@ -130,14 +130,13 @@ fn check_parents(
     label: &str,
     mut parents: impl Iterator<Item = usize>,
     records: &[Option<Record>],
-) -> Result<(), StageFailure> {
+) -> anyhow::Result<()> {
     let Some(parent) = parents.find(|&parent| records[parent].is_none()) else {
         return Ok(());
     };
     let parent = plan.nodes[parent].label();
-    let problem = format!(
+    bail_bad_input!(
         "{label} needs {parent}, which has no artifact: its job failed, was cancelled, or is \
         unknown to Slurm; run again"
     );
-    Err(failure_with(StageFailure::BAD_INPUT, problem))
 }

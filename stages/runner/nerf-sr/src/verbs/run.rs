@@ -3,13 +3,12 @@ use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
 use artifact::report_line;
-use planning::stage_call::{StageFailure, stop_on_signals};
+use planning::stage_call::stop_on_signals;
 use planning::{Describing, Plan, Request, State, stored_inputs};
 use store::{RunFile, Store};
 
 use crate::estimates::Estimates;
 use crate::execute::Executor;
-use crate::failure;
 use crate::session::{Run, Session, check_not_in_input, command_line};
 use crate::waiting::enter_store;
 
@@ -40,20 +39,19 @@ pub(super) fn begin_run(
     store: &Store,
     plan: &Plan,
     stop: &AtomicBool,
-) -> Result<(RunFile, Vec<State>), StageFailure> {
+) -> anyhow::Result<(RunFile, Vec<State>)> {
     let entered = enter_store(store, stop, &|text| report_line!("nerf-sr: {text}"))?;
-    let file = store.begin_run(&entered, command_line()).map_err(failure)?;
+    let file = store.begin_run(&entered, command_line())?;
     // An unreadable input folder is reported when its stage is due: other stages may not need it.
     let states = plan.states(store, Some(stop)).unwrap_or_default();
     for (index, node) in plan.nodes.iter().enumerate() {
         match states.get(index).and_then(State::key) {
             Some(key) => file.record_action(&entered, &node.stage, &key),
             None => file.record_waiting(&entered, node.partial_key()),
-        }
-        .map_err(failure)?;
+        }?;
     }
-    for record in stored_inputs(&plan.nodes, store).map_err(failure)? {
-        file.record_action(&entered, &record.stage, &record.key()).map_err(failure)?;
+    for record in stored_inputs(&plan.nodes, store)? {
+        file.record_action(&entered, &record.stage, &record.key())?;
     }
     Ok((file, states))
 }

@@ -103,7 +103,7 @@ impl Verification<'_> {
     /// Enters the store. This fails if a newer version of nerf-sr has upgraded the store meanwhile:
     /// content that looks damaged to this version may then be intact. A signal ends the process.
     fn enter(&self) -> anyhow::Result<Entered> {
-        Ok(enter_store(self.store, &AtomicBool::new(false), &|text| self.print(&text))?)
+        enter_store(self.store, &AtomicBool::new(false), &|text| self.print(&text))
     }
 
     fn print(&self, line: &dyn Display) {
