@@ -16,7 +16,7 @@ use slurm::{Memory, Site};
 use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
 use crate::garbage::Policy;
 use crate::session::Session;
-use crate::verbs::{self, GcOutput, GraphFormat, Limits};
+use crate::verbs::{self, GraphFormat, Limits};
 use crate::watch::Watch;
 
 const DEFAULT_PIPELINE: &str = "pipeline.yaml";
@@ -330,7 +330,7 @@ pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
         Verb::Pin { name, plan } => verbs::pin(&global.open_session()?, &name, &plan.into()),
         Verb::Unpin { name } => verbs::unpin(&global.open_session()?, &name),
         Verb::Gc { plan, dry_run, policy, json } => {
-            verbs::gc(&global.open_session()?, &plan.into(), policy, GcOutput { dry_run, json })
+            verbs::gc(&global.open_session()?, &plan.into(), policy, dry_run, json)
         }
         Verb::Describe { stage } => {
             let pipeline = Pipeline::read(&global.pipeline).map_err(PlanError::from)?;

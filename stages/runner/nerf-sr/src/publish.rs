@@ -204,7 +204,7 @@ fn hidden(target: &Path, suffix: &str) -> PathBuf {
 /// Locks a folder of pages. Runs with different stores may publish into the same folder, so the
 /// store's locks aren't enough.
 fn lock_folder(folder: &Path, stop: &AtomicBool) -> anyhow::Result<File> {
-    wait_for_lock(stop, &|_, _| {}, || {
+    wait_for_lock(stop, "pages are being written", &|_| {}, || {
         let file = File::open(folder)
             .map_err(|source| StoreError::Io { path: folder.to_path_buf(), source })?;
         Ok(if is_lock_acquired(folder, file.try_lock())? {

@@ -2,7 +2,7 @@
 //! cached, but a sink whose page shows the same record already isn't called again.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use artifact::{
     MANIFEST_FILE, Manifest, RunRecord, format_count, format_size, hash_json, list_output_files,
@@ -43,35 +43,6 @@ pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, records: &[Option<Record
     })
 }
 
-/// Result of [`run_sink`].
-pub(crate) enum SinkResult {
-    /// The sink wrote its folder. `archived` are the new paths of earlier pages.
-    Written { folder: PathBuf, archived: Vec<PathBuf> },
-    /// The folder already shows this record.
-    UpToDate(PathBuf),
-    /// A node that the sink shows has no record.
-    Incomplete,
-}
-
-impl SinkResult {
-    /// Prints the path of the sink's page, and the new paths of earlier pages.
-    pub(crate) fn print(&self, stage: &str) {
-        match self {
-            Self::Written { folder, archived } => {
-                for folder in archived {
-                    print_line!("{stage}: moved the earlier page to {}", page_path(folder));
-                }
-                print_line!("{stage}: {}", page_path(folder));
-                for entry in listing(folder) {
-                    print_line!("{stage}: {entry}");
-                }
-            }
-            Self::UpToDate(folder) => print_line!("{stage}: {} (up to date)", page_path(folder)),
-            Self::Incomplete => print_line!("{stage}: nothing to show"),
-        }
-    }
-}
-
 /// Returns the path of the page in a sink's folder, or the folder if it has no page.
 fn page_path(folder: &Path) -> String {
     let page = folder.join("index.html");
@@ -103,23 +74,28 @@ fn listing(folder: &Path) -> Vec<String> {
     lines.collect()
 }
 
-/// Calls a sink and publishes its page as `out/STAGE`.
+/// Calls a sink, publishes its page as `out/STAGE`, and prints its path and the new paths of earlier
+/// pages. Returns whether a page was written: not if a node that the sink shows has no record, or if
+/// the folder already shows this record.
 pub(crate) fn run_sink(
     run: &Run<'_>,
     sink: &Sink,
     threads: usize,
     progress: &RunProgress<'_>,
-) -> anyhow::Result<SinkResult> {
+) -> anyhow::Result<bool> {
     let Some((mut record, indices)) = run_record(run, sink, progress) else {
-        return Ok(SinkResult::Incomplete);
+        print_line!("{}: nothing to show", sink.stage);
+        return Ok(false);
     };
-    let target = run.out.join(&sink.stage);
+    let stage = &sink.stage;
+    let target = run.out.join(stage);
     let identity = page_identity(sink, &record);
     if has_current_page(&target, &identity) {
-        return Ok(SinkResult::UpToDate(target));
+        print_line!("{stage}: {} (up to date)", page_path(&target));
+        return Ok(false);
     }
     add_details(&mut record, run.plan, &indices, progress);
-    let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
+    let scratch = run.store.scratch(run.file.id()).join(stage);
     let output = scratch.join("output");
     call_confirmed(&sink.program, run.store, run.stop, || {
         call(run, sink, threads, &record, &scratch, &output)
@@ -141,7 +117,14 @@ pub(crate) fn run_sink(
     let archived = publish(&output, &target, kind, run.stop)?;
     // Leftovers of a sink have no value.
     std::fs::remove_dir_all(&scratch).ok();
-    Ok(SinkResult::Written { folder: target, archived })
+    for folder in archived {
+        print_line!("{stage}: moved the earlier page to {}", page_path(&folder));
+    }
+    print_line!("{stage}: {}", page_path(&target));
+    for entry in listing(&target) {
+        print_line!("{stage}: {entry}");
+    }
+    Ok(true)
 }
 
 /// Calls a sink's program, which reads `run.json` and writes `output`.

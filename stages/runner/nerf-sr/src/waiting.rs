@@ -12,11 +12,12 @@ const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
 /// with each notice.
 const NOTICE_DELAY: Duration = Duration::from_secs(1);
 
-/// Attempts to lock until this succeeds or `stop` is set. `report` gets the holder and the time
-/// waited so far.
+/// Attempts to lock until this succeeds or `stop` is set. `report` gets a notice that begins with
+/// `cause`, and names the holder and the time waited so far.
 pub(crate) fn wait_for_lock<T>(
     stop: &AtomicBool,
-    report: &dyn Fn(Option<&Holder>, Duration),
+    cause: &str,
+    report: &dyn Fn(&str),
     mut attempt: impl FnMut() -> Result<Locked<T>, StoreError>,
 ) -> anyhow::Result<T> {
     let begin = Instant::now();
@@ -29,7 +30,9 @@ pub(crate) fn wait_for_lock<T>(
                     return Err(Failure::Interrupted.into());
                 }
                 if begin.elapsed() >= next_notice {
-                    report(holder.as_ref(), begin.elapsed());
+                    let holder = holder_text(holder.as_ref());
+                    let waited = format_duration(begin.elapsed().as_secs_f64());
+                    report(&format!("{cause}{holder}; waiting ({waited} so far)"));
                     next_notice *= 2;
                 }
                 std::thread::sleep(ATTEMPT_INTERVAL);
@@ -44,17 +47,7 @@ pub(crate) fn enter_store(
     stop: &AtomicBool,
     report: &dyn Fn(&str),
 ) -> anyhow::Result<Entered> {
-    wait_for_lock(
-        stop,
-        &|holder, waited| {
-            report(&format!(
-                "waiting for garbage collection{} ({} so far)",
-                holder_text(holder),
-                format_duration(waited.as_secs_f64())
-            ));
-        },
-        || store.try_enter(),
-    )
+    wait_for_lock(stop, "garbage is being collected", report, || store.try_enter())
 }
 
 /// Enters the store, or fails if garbage collection runs.
@@ -66,7 +59,7 @@ pub(crate) fn try_enter_store(store: &Store) -> anyhow::Result<Entered> {
 }
 
 /// Returns ` by process …` for a lock's holder; empty if the holder is unknown.
-pub(crate) fn holder_text(holder: Option<&Holder>) -> String {
+fn holder_text(holder: Option<&Holder>) -> String {
     let Some(Holder { pid, host, .. }) = holder else { return String::new() };
     if *host != host_name() {
         return format!(" by process {pid} on {host}");
@@ -95,13 +88,15 @@ mod tests {
         let Locked::Acquired(_lock) = store.try_lock("k").unwrap() else { panic!("held") };
         let stop = AtomicBool::new(false);
         let reports = RefCell::new(Vec::new());
-        let report = |holder: Option<&Holder>, _: Duration| {
-            reports.borrow_mut().push(holder_text(holder));
+        let report = |text: &str| {
+            reports.borrow_mut().push(text.to_owned());
             stop.store(true, Ordering::Relaxed);
         };
-        let failure = wait_for_lock(&stop, &report, || store.try_lock("k")).unwrap_err();
+        let failure =
+            wait_for_lock(&stop, "is in use", &report, || store.try_lock("k")).unwrap_err();
         assert_eq!(crate::exit_code(&failure), 130);
-        assert_eq!(reports.into_inner(), [format!(" by process {}", std::process::id())]);
+        let text = format!("is in use by process {}; waiting (1.0 s so far)", std::process::id());
+        assert_eq!(reports.into_inner(), [text]);
     }
 
     #[test]

@@ -19,7 +19,7 @@ use crate::estimates::{check_memory, run_text, total_comparison_text};
 use crate::run_messages::{command_text, end_message, failure_message};
 use crate::run_record::RunProgress;
 use crate::session::{Run, command_line};
-use crate::sink::{SinkResult, run_sink};
+use crate::sink::run_sink;
 use crate::stage_failure;
 use crate::watch::{Chain, Watch};
 
@@ -105,10 +105,7 @@ impl Local {
                 return Err(Failure::Interrupted.into());
             }
             match result {
-                Ok(result) => {
-                    result.print(&sink.stage);
-                    sinks_outcome.has_written |= matches!(result, SinkResult::Written { .. });
-                }
+                Ok(has_written) => sinks_outcome.has_written |= has_written,
                 Err(error) => {
                     let StageFailure { code, message } = stage_failure(&error);
                     report_line!("nerf-sr: {}: {message}", sink.stage);

@@ -3,18 +3,18 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use artifact::{format_duration, hash_json, unix_time};
 use planning::stage_call::{Call, Display, StageDisplay, StageFailure, Usage, read_summary};
 use planning::{HashedInputs, Node, Origin, hash_inputs, short_hash, stored_inputs};
 use serde_json::{Map, Value};
-use store::{Attempt, Entered, Holder, KeyLock, Record, Store, TimeSpent, Unfinished, host_name};
+use store::{Attempt, Entered, KeyLock, Record, Store, TimeSpent, Unfinished, host_name};
 
 use crate::estimates::{Estimate, comparison_text};
 use crate::session::Run;
 use crate::unchanged::{Inputs, call_confirmed};
-use crate::waiting::{enter_store, holder_text, wait_for_lock};
+use crate::waiting::{enter_store, wait_for_lock};
 use crate::watch::{Chain, Watch, Watching, scratch_name};
 
 /// Action of a node that isn't cached.
@@ -73,11 +73,10 @@ impl NodeJob<'_> {
     /// the stage ran.
     pub(crate) fn carry_out(&self, pending: PendingAction) -> anyhow::Result<(Record, bool)> {
         let PendingAction { key, key_parts, inputs } = pending;
-        let lock = wait_for_lock(
-            self.run.stop,
-            &|holder, waited| self.report_waiting(holder, waited),
-            || self.run.store.try_lock(&key),
-        )?;
+        let report = |text: &str| self.report(text);
+        let lock = wait_for_lock(self.run.stop, "is being created", &report, || {
+            self.run.store.try_lock(&key)
+        })?;
         let stored = stored_inputs([self.node], self.run.store)?;
         let action = Unfinished {
             stage: self.node.stage.clone(),
@@ -113,11 +112,6 @@ impl NodeJob<'_> {
 
     fn enter(&self) -> anyhow::Result<Entered> {
         enter_store(self.run.store, self.run.stop, &|text| self.report(text))
-    }
-
-    fn report_waiting(&self, holder: Option<&Holder>, waited: Duration) {
-        let waited = format_duration(waited.as_secs_f64());
-        self.report(&format!("is being created{}; waiting ({waited} so far)", holder_text(holder)));
     }
 
     /// Calls the stage and publishes its artifact.

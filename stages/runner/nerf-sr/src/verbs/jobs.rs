@@ -107,7 +107,7 @@ fn run_task(run: &Run<'_>, command: &[String]) -> anyhow::Result<()> {
     if let Some(sink) = run.plan.sinks.first() {
         check_parents(run.plan, &sink.stage, sink.nodes().into_iter(), &records)?;
         let progress = RunProgress { command, ..RunProgress::not_started(&records) };
-        run_sink(run, sink, threads, &progress)?.print(&sink.stage);
+        run_sink(run, sink, threads, &progress)?;
         return Ok(());
     }
     let Some(node) = run.plan.nodes.last() else { return Ok(()) };

@@ -19,7 +19,7 @@ use serde::Serialize;
 
 pub(crate) use advise::{Limits, advise};
 pub(crate) use diff::diff;
-pub(crate) use gc::{GcOutput, gc};
+pub(crate) use gc::gc;
 pub(crate) use graph::{GraphFormat, graph};
 pub(crate) use jobs::{cancel, job};
 pub(crate) use log::log;
