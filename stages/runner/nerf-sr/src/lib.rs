@@ -16,11 +16,10 @@
 //!   two results and their inputs.
 //! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: gives the run's record (`run_record`) to stages that show it, such as the report, and
-//!   publishes their pages (`publish`, `page`, `archive`).
+//!   publishes their pages (`publish`, `page`).
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
-mod archive;
 mod cli;
 mod estimates;
 mod execute;

@@ -87,15 +87,14 @@ impl PlanReport {
         states: &[State],
         records: &[Record],
     ) -> Result<Self, StoreError> {
-        let mut nodes = Vec::with_capacity(plan.nodes.len());
-        for (number, state) in states.iter().enumerate() {
-            nodes.push(NodeReport::new(session, plan, number, state, records)?);
-        }
+        let nodes = states.iter().enumerate();
+        let nodes =
+            nodes.map(|(number, state)| NodeReport::new(session, plan, number, state, records));
         let sinks = plan.sinks.iter().map(|sink| SinkReport {
             stage: sink.stage.clone(),
             shows: sink.nodes().into_iter().collect(),
         });
-        Ok(Self { nodes, sinks: sinks.collect() })
+        Ok(Self { nodes: nodes.collect::<Result<_, _>>()?, sinks: sinks.collect() })
     }
 
     /// Keeps the nodes of a stage, or those that a sink shows.

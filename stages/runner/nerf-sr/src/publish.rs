@@ -1,7 +1,6 @@
 //! Publishing of a sink's page: the page is copied next to the old one, then exchanged for it
 //! atomically. A folder is replaced only if a sink wrote all of it and nobody has changed it
-//! ([`crate::page`]). A page that shows a result which the new one lacks is archived
-//! ([`crate::archive`]).
+//! ([`crate::page`]). A page that shows a result which the new one lacks is archived.
 //!
 //! A kill may leave one of these next to a target `NAME`; the next publishing finishes the work:
 //!
@@ -21,8 +20,7 @@ use artifact::{Manifest, list_files};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 use store::{Locked, StoreError, is_lock_acquired};
 
-use crate::archive::archive_path;
-use crate::page::{PageMark, check_ownership};
+use crate::page::{PageMark, archive_path, check_ownership};
 use crate::waiting::wait_for_lock;
 
 /// True if the target is a page with this identity and all its files, and a killed publishing left

@@ -10,7 +10,8 @@ use store::{Record, Store};
 
 use crate::session::Run;
 
-/// Progress of a run.
+/// Progress of a run; by default, that before its first stage.
+#[derive(Default)]
 pub(crate) struct RunProgress<'a> {
     /// Records by node index; `None` if the node isn't done.
     pub(crate) records: &'a [Option<Record>],
@@ -20,13 +21,6 @@ pub(crate) struct RunProgress<'a> {
     pub(crate) failures: &'a [(usize, StageFailure)],
     /// Command line of the run.
     pub(crate) command: &'a [String],
-}
-
-impl<'a> RunProgress<'a> {
-    /// Returns the progress of a run before its first stage.
-    pub(crate) fn not_started(records: &'a [Option<Record>]) -> Self {
-        Self { records, ran: None, failures: &[], command: &[] }
-    }
 }
 
 /// Returns the record of the nodes that a sink shows and of their ancestors, and the indices of the

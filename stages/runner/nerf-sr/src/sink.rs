@@ -37,7 +37,7 @@ pub(crate) fn sink_parts(sink: &Sink) -> Map<String, Value> {
 
 /// True if a sink's page already shows these records.
 pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, records: &[Option<Record>]) -> bool {
-    let record = run_record(run, sink, &RunProgress::not_started(records));
+    let record = run_record(run, sink, &RunProgress { records, ..RunProgress::default() });
     record.is_some_and(|(record, _)| {
         has_current_page(&run.out.join(&sink.stage), &page_identity(sink, &record))
     })

@@ -64,7 +64,8 @@ impl<'a> Inputs<'a> {
         if !node.program.is_own() {
             // The runner's own programs compare files with manifests themselves.
             for artifact in &inputs.artifacts {
-                artifact.check_contents().map_err(|e| damage_failure(&e))?;
+                let checked = artifact.manifest.check_contents(&artifact.folder);
+                checked.map_err(|e| damage_failure(&e))?;
             }
         }
         Ok(inputs)
@@ -163,21 +164,15 @@ impl StoredInput {
         let now = stamps(&self.folder, &self.manifest)?;
         let is_untouched =
             now.iter().enumerate().all(|(i, stamp)| stamp.is_untouched_since(&self.stamps[i]));
-        if is_untouched { Ok(()) } else { self.check_contents() }
-    }
-
-    fn check_contents(&self) -> Result<(), Damage> {
-        self.manifest.check_contents(&self.folder)
+        if is_untouched { Ok(()) } else { self.manifest.check_contents(&self.folder) }
     }
 }
 
 fn stamps(folder: &Path, manifest: &Manifest) -> Result<Vec<Stamp>, Damage> {
-    let mut stamps = Vec::with_capacity(manifest.files.len());
-    for file in &manifest.files {
-        let path = folder.join(&file.path);
-        stamps.push(Stamp::of(&path).map_err(|source| Damage::Unreadable { path, source })?);
-    }
-    Ok(stamps)
+    let paths = manifest.files.iter().map(|file| folder.join(&file.path));
+    paths
+        .map(|path| Stamp::of(&path).map_err(|source| Damage::Unreadable { path, source }))
+        .collect()
 }
 
 #[cfg(test)]

@@ -63,14 +63,14 @@ impl Executor for Local {
             return Ok(ExitCode::from(failure.code));
         }
         print_summaries(run, &outcome);
-        let sinks = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
-        if let Some(code) = sinks.first_failure {
+        let (has_written, first_failure) = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
+        if let Some(code) = first_failure {
             return Ok(ExitCode::from(code));
         }
         let ran = outcome.ran.iter();
         let ran = ran.filter_map(|&index| Some((index, outcome.records[index].as_ref()?)));
         let comparison = total_comparison_text(run.estimates, ran);
-        let end = end_message(outcome.ran.len(), plan.nodes.len(), sinks.has_written);
+        let end = end_message(outcome.ran.len(), plan.nodes.len(), has_written);
         print_line!("{end}{}", comparison.map_or_else(String::new, |text| format!("; {text}")));
         Ok(ExitCode::SUCCESS)
     }
@@ -85,48 +85,41 @@ impl Local {
         command_text([program, "log", stage].into_iter().chain(arguments))
     }
 
-    /// Runs sinks, and prints the paths of their pages and their failures.
+    /// Runs sinks, and prints the paths of their pages and their failures. Returns whether a page was
+    /// written, and the exit code of the first sink that failed.
     fn run_sinks<'a>(
         &self,
         run: &Run<'_>,
         sinks: impl Iterator<Item = &'a Sink>,
         outcome: &Outcome,
-    ) -> anyhow::Result<SinksOutcome> {
+    ) -> anyhow::Result<(bool, Option<u8>)> {
         let progress = RunProgress {
             records: &outcome.records,
             ran: Some(&outcome.ran),
             failures: &outcome.failures,
             command: &command_line(),
         };
-        let mut sinks_outcome = SinksOutcome::default();
+        let (mut any_written, mut first_failure) = (false, None);
         for sink in sinks {
             let result = run_sink(run, sink, self.budget.cores, &progress);
             if run.stop.load(Ordering::Relaxed) {
                 return Err(Failure::Interrupted.into());
             }
             match result {
-                Ok(has_written) => sinks_outcome.has_written |= has_written,
+                Ok(is_written) => any_written |= is_written,
                 Err(error) => {
                     let StageFailure { code, message } = stage_failure(&error);
                     report_line!("nerf-sr: {}: {message}", sink.stage);
-                    sinks_outcome.first_failure.get_or_insert(code);
+                    first_failure.get_or_insert(code);
                 }
             }
         }
-        Ok(sinks_outcome)
+        Ok((any_written, first_failure))
     }
 }
 
-/// Outcome of a run's sinks.
-#[derive(Default)]
-struct SinksOutcome {
-    /// True if a page was written.
-    has_written: bool,
-    /// Exit code of the first sink that failed.
-    first_failure: Option<u8>,
-}
-
 /// Outcome of a run's nodes.
+#[derive(Default)]
 struct Outcome {
     /// Records by node index; `None` if the node isn't done.
     records: Vec<Option<Record>>,
@@ -199,12 +192,7 @@ impl<'a> Schedule<'a> {
             ready: BTreeMap::new(),
             running: BTreeMap::new(),
             records: OnceCell::new(),
-            outcome: Outcome {
-                records: vec![None; count],
-                ran: BTreeSet::new(),
-                failures: Vec::new(),
-                skipped: 0,
-            },
+            outcome: Outcome { records: vec![None; count], ..Outcome::default() },
         }
     }
 

@@ -248,10 +248,8 @@ fn image_parameters(set: &Dataset) -> String {
 /// Converts an error of the data set's reader: if the folder contains images, the message names the
 /// command that estimates their cameras.
 fn read_failure(folder: &Path, error: &DatasetError) -> Failure {
-    let images = UnposedImages::find(folder);
-    if !error.is_unrecognised() || images.files.is_empty() {
-        return Failure::BadInput(error.to_string());
-    }
+    let images = UnposedImages::find(folder).filter(|_| error.is_unrecognised());
+    let Some(images) = images else { return Failure::BadInput(error.to_string()) };
     let remedy = if images.files.len() == 1 {
         "give several photographs, taken from different positions".to_owned()
     } else {

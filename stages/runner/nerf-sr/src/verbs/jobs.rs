@@ -106,7 +106,7 @@ fn run_task(run: &Run<'_>, command: &[String]) -> anyhow::Result<()> {
     stage::start_threads(threads);
     if let Some(sink) = run.plan.sinks.first() {
         check_parents(run.plan, &sink.stage, sink.nodes().into_iter(), &records)?;
-        let progress = RunProgress { command, ..RunProgress::not_started(&records) };
+        let progress = RunProgress { records: &records, command, ..RunProgress::default() };
         run_sink(run, sink, threads, &progress)?;
         return Ok(());
     }

@@ -1,8 +1,8 @@
 use std::collections::BTreeSet;
 use std::process::ExitCode;
 
-use artifact::{FailureExt as _, bail_bad_input, print_line, relative_path};
-use planning::{PlanError, Request, State};
+use artifact::{FailureExt as _, bail_bad_input, bail_usage, print_line, relative_path};
+use planning::{Request, State};
 
 use crate::session::{Session, nodes_of_stage};
 
@@ -40,8 +40,7 @@ pub(crate) fn path(
                 .map(|file| file.path.split('/').next().unwrap_or_default())
                 .collect();
             let known = artifact::known_names(inner.unwrap_or_default(), known);
-            let message = format!("{stage_path}: {stage} has no such folder or file; {known}");
-            return Err(PlanError::Usage(message).into());
+            bail_usage!("{stage_path}: {stage} has no such folder or file; {known}");
         }
         print_line!("{}", path.display());
     }

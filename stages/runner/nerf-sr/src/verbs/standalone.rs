@@ -7,7 +7,7 @@ use std::process::{Command, ExitCode};
 
 use crate::starter::Starter;
 use anyhow::Context as _;
-use artifact::{format_count, print_line, print_lines};
+use artifact::{bail_usage, format_count, print_line, print_lines};
 use planning::{Describing, Pipeline, PlanError, Programs, executable, is_own, own_program};
 use stage::render_help;
 use store::Store;
@@ -52,7 +52,7 @@ pub(crate) fn describe(
     let (pipeline, _) = found?;
     if !has_block {
         let known = artifact::known_names(stage, pipeline.stages.keys().map(String::as_str));
-        return Err(PlanError::Usage(format!("no stage {stage:?}; {known}")).into());
+        bail_usage!("no stage {stage:?}; {known}");
     }
     let program = executable(&pipeline, stage);
     if is_own(&program) {
