@@ -307,38 +307,41 @@ pub(crate) fn plan_request(words: impl Iterator<Item = String>) -> Result<Reques
 pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
     let Cli { verb, global } = Cli::parse();
     match verb {
-        Verb::Run { plan, options } => run(&global, plan, options),
-        Verb::Cancel { stage } => verbs::cancel(&global.open_session()?.store, stage.as_deref()),
-        Verb::Job { submission, number } => verbs::job(&submission, number),
-        Verb::Init { folder } => verbs::init(&folder, &global.pipeline),
-        Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json),
-        Verb::Advise { plan, limits } => {
-            let arguments = global.plan_arguments(&plan);
-            verbs::advise(&global.open_session()?, &plan.into(), limits, &arguments)
-        }
-        Verb::Why { stage, plan, json } => {
-            verbs::why(&global.open_session()?, &stage, &plan.into(), json)
-        }
-        Verb::Status { plan, json } => verbs::status(&global.open_session()?, &plan.into(), json),
-        Verb::Path { stage, plan } => verbs::path(&global.open_session()?, &stage, &plan.into()),
-        Verb::Diff { before, now, json } => {
-            verbs::diff(&global.open_session()?, &before, &now, json)
-        }
-        Verb::Graph { plan, format } => verbs::graph(&global.open_session()?, &plan.into(), format),
-        Verb::Log { stage, plan } => verbs::log(&global.open_session()?, &stage, &plan.into()),
-        Verb::Verify { remove } => verbs::verify(&global.open_session()?.store, remove),
-        Verb::Pin { name, plan } => verbs::pin(&global.open_session()?, &name, &plan.into()),
-        Verb::Unpin { name } => verbs::unpin(&global.open_session()?, &name),
-        Verb::Gc { plan, dry_run, policy, json } => {
-            verbs::gc(&global.open_session()?, &plan.into(), policy, dry_run, json)
-        }
+        Verb::Run { plan, options } => return run(&global, plan, options),
+        Verb::Job { submission, number } => return verbs::job(&submission, number),
+        Verb::Verify { remove } => return verbs::verify(&global.open_session()?.store, remove),
         Verb::Describe { stage } => {
             let pipeline = Pipeline::read(&global.pipeline).map_err(PlanError::from)?;
-            verbs::describe(&pipeline, &stage, || Ok(global.open_session()?.store))
+            return verbs::describe(&pipeline, &stage, || Ok(global.open_session()?.store));
         }
-        Verb::Man { folder } => verbs::man(Cli::command(), &folder),
-        Verb::Completions { shell } => Ok(verbs::completions(shell, &mut Cli::command())),
+        Verb::Init { folder } => verbs::init(&folder, &global.pipeline)?,
+        Verb::Man { folder } => verbs::man(Cli::command(), &folder)?,
+        Verb::Completions { shell } => verbs::completions(shell, &mut Cli::command()),
+        Verb::Cancel { stage } => verbs::cancel(&global.open_session()?.store, stage.as_deref())?,
+        Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json)?,
+        Verb::Advise { plan, limits } => {
+            let arguments = global.plan_arguments(&plan);
+            verbs::advise(&global.open_session()?, &plan.into(), limits, &arguments)?;
+        }
+        Verb::Why { stage, plan, json } => {
+            verbs::why(&global.open_session()?, &stage, &plan.into(), json)?;
+        }
+        Verb::Status { plan, json } => verbs::status(&global.open_session()?, &plan.into(), json)?,
+        Verb::Path { stage, plan } => verbs::path(&global.open_session()?, &stage, &plan.into())?,
+        Verb::Diff { before, now, json } => {
+            verbs::diff(&global.open_session()?, &before, &now, json)?;
+        }
+        Verb::Graph { plan, format } => {
+            verbs::graph(&global.open_session()?, &plan.into(), format)?;
+        }
+        Verb::Log { stage, plan } => verbs::log(&global.open_session()?, &stage, &plan.into())?,
+        Verb::Pin { name, plan } => verbs::pin(&global.open_session()?, &name, &plan.into())?,
+        Verb::Unpin { name } => verbs::unpin(&global.open_session()?, &name)?,
+        Verb::Gc { plan, dry_run, policy, json } => {
+            verbs::gc(&global.open_session()?, &plan.into(), policy, dry_run, json)?;
+        }
     }
+    Ok(ExitCode::SUCCESS)
 }
 
 fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Result<ExitCode> {

@@ -1,7 +1,5 @@
 //! `advise` estimates time and memory of each quality.
 
-use std::process::ExitCode;
-
 use artifact::{format_count, format_duration, format_size, print_line};
 use planning::{Node, Plan, Quality, Request};
 use slurm::Memory;
@@ -83,7 +81,7 @@ pub(crate) fn advise(
     request: &Request,
     limits: Limits,
     arguments: &[String],
-) -> anyhow::Result<ExitCode> {
+) -> anyhow::Result<()> {
     let processors = stage::processors().count;
     let mut all = Vec::new();
     for quality in Quality::ALL {
@@ -99,7 +97,7 @@ pub(crate) fn advise(
     words.extend(["-p", &quality]);
     words.extend(memory.iter().flat_map(|memory| ["--memory", memory]));
     print_line!("{}", command_text(words));
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 fn print_table(all: &[QualityCosts], processors: usize) {

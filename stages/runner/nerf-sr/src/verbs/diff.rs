@@ -1,5 +1,3 @@
-use std::process::ExitCode;
-
 use artifact::{bail_bad_input, print_line};
 use planning::{Change, PlanError, Request, State};
 
@@ -14,12 +12,7 @@ const MAX_LISTED_FILES: usize = 4;
 const MIN_HASH_CHARS: usize = 6;
 
 /// Prints the differences between two results and the actions that they depend on.
-pub(crate) fn diff(
-    session: &Session,
-    before: &str,
-    now: &str,
-    json: bool,
-) -> anyhow::Result<ExitCode> {
+pub(crate) fn diff(session: &Session, before: &str, now: &str, json: bool) -> anyhow::Result<()> {
     let (before, now) = (read_side(session, before)?, read_side(session, now)?);
     let differences = now.differences(&before, &session.store)?;
     if json {
@@ -31,7 +24,7 @@ pub(crate) fn diff(
     if differences.is_empty() {
         print_line!("no differences");
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Returns one line per difference of a stage; many files share one line.

@@ -1,5 +1,3 @@
-use std::process::ExitCode;
-
 use crate::garbage::{Collection, Policy, Root};
 use anyhow::Context as _;
 use artifact::{format_size, print_line, report_line};
@@ -19,7 +17,7 @@ pub(crate) fn gc(
     policy: Policy,
     dry_run: bool,
     json: bool,
-) -> anyhow::Result<ExitCode> {
+) -> anyhow::Result<()> {
     let store = &session.store;
     let root = plan_root(session, request)?;
     if dry_run {
@@ -41,7 +39,7 @@ pub(crate) fn gc(
 const UNREADABLE: &str = "nothing was deleted, because gc must read the whole store; make this \
     file readable or move it away";
 
-fn print(collection: &Collection, dry_run: bool, json: bool) -> anyhow::Result<ExitCode> {
+fn print(collection: &Collection, dry_run: bool, json: bool) -> anyhow::Result<()> {
     let decisions = collection.decisions();
     let (mut deleted, mut kept) = (0, 0);
     for decision in &decisions {
@@ -61,7 +59,7 @@ fn print(collection: &Collection, dry_run: bool, json: bool) -> anyhow::Result<E
     } else {
         print_line!("{deleted} deleted, {kept} kept");
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Returns the root that keeps the plan's actions.

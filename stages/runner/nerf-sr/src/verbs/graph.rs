@@ -1,5 +1,3 @@
-use std::process::ExitCode;
-
 use artifact::print_lines;
 use planning::{Origin, Plan, Request, State};
 
@@ -18,14 +16,14 @@ pub(crate) fn graph(
     session: &Session,
     request: &Request,
     format: GraphFormat,
-) -> anyhow::Result<ExitCode> {
+) -> anyhow::Result<()> {
     let (plan, states) = session.plan_with_states(request)?;
     let vertices = vertices(&plan, &states);
     print_lines(&match format {
         GraphFormat::Text => draw_as_text(&vertices),
         GraphFormat::Dot => draw_for_graphviz(&vertices),
     });
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// A node or sink in the graph.

@@ -23,7 +23,7 @@ use crate::stage_failure;
 
 /// Cancels the jobs of this store, or those of one stage. Slurm also cancels the jobs that depend
 /// on them.
-pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<ExitCode> {
+pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<()> {
     let slurm = Slurm::default();
     let mut jobs = Queue::read(&slurm, store.root())?.jobs;
     jobs.retain(|job| stage.is_none_or(|stage| job.task.stage == stage));
@@ -33,7 +33,7 @@ pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<ExitC
     }
     let of_stage = stage.map(|stage| format!(" of {stage}")).unwrap_or_default();
     print_line!("cancelled {}{of_stage}", format_count(jobs.len(), "job"));
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Runs one task of a submission as a cluster's job: a node whose parents' jobs have ended, or a

@@ -1,6 +1,5 @@
 use std::fs::Metadata;
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::time::UNIX_EPOCH;
 
 use anyhow::Context as _;
@@ -13,7 +12,7 @@ use crate::identities::node_identities;
 use crate::session::{Session, nodes_of_stage};
 
 /// Prints the logs of a stage's nodes, or the log of the stage's last run with any arguments.
-pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::Result<ExitCode> {
+pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::Result<()> {
     let plan = session.plan(request)?;
     let nodes = nodes_of_stage(&plan, stage);
     let logs = nodes.as_ref().map_or(Ok(Vec::new()), |nodes| find_logs(session, &plan, nodes))?;
@@ -21,20 +20,20 @@ pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::
         log.print()?;
     }
     if !logs.is_empty() {
-        return Ok(ExitCode::SUCCESS);
+        return Ok(());
     }
     let Some((unix, log)) = find_last_log(&session.store, stage)? else {
         // A stage of the plan may not have a log yet; an unknown stage is an error.
         nodes?;
         print_line!("{stage}: has not run yet");
-        return Ok(ExitCode::SUCCESS);
+        return Ok(());
     };
     print_line!(
         "{stage}: no log for these arguments; this is the log of its last run, {}",
         format_utc(unix)
     );
     log.print()?;
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Log of one node.

@@ -13,8 +13,6 @@ mod standalone;
 mod states;
 mod verify;
 
-use std::process::ExitCode;
-
 use serde::Serialize;
 
 pub(crate) use advise::{Limits, advise};
@@ -31,7 +29,7 @@ pub(crate) use states::{plan, status, why};
 pub(crate) use verify::verify;
 
 /// Prints a value as JSON.
-fn print_json(value: &impl Serialize) -> anyhow::Result<ExitCode> {
+fn print_json(value: &impl Serialize) -> anyhow::Result<()> {
     artifact::print_lines(&serde_json::to_string_pretty(value)?);
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }

@@ -1,5 +1,4 @@
 use std::collections::BTreeSet;
-use std::process::ExitCode;
 
 use artifact::{FailureExt as _, bail_bad_input, bail_usage, print_line, relative_path};
 use planning::{Request, State};
@@ -8,11 +7,7 @@ use crate::session::{Session, nodes_of_stage};
 
 /// Prints the path of a stage's artifact, or of a folder or file in it, one line per point of a
 /// sweep.
-pub(crate) fn path(
-    session: &Session,
-    stage_path: &str,
-    request: &Request,
-) -> anyhow::Result<ExitCode> {
+pub(crate) fn path(session: &Session, stage_path: &str, request: &Request) -> anyhow::Result<()> {
     let (stage, inner) = match stage_path.split_once('/') {
         Some((stage, inner)) => (stage, Some(inner)),
         None => (stage_path, None),
@@ -44,5 +39,5 @@ pub(crate) fn path(
         }
         print_line!("{}", path.display());
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }

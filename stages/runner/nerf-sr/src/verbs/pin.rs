@@ -1,5 +1,3 @@
-use std::process::ExitCode;
-
 use artifact::{Failure, bail_usage, format_count, known_names, print_line};
 use planning::{Request, State, stored_inputs};
 
@@ -10,7 +8,7 @@ use crate::waiting::try_enter_store;
 const MAX_NAME_BYTES: usize = 100;
 
 /// Protects the targets' artifacts from garbage collection.
-pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::Result<ExitCode> {
+pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::Result<()> {
     check_name(name)?;
     let plan = session.plan(request)?;
     let entered = try_enter_store(&session.store)?;
@@ -27,15 +25,15 @@ pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::R
     }
     session.store.pin(&entered, name, command_line(), &actions)?;
     print_line!("pinned {} as {name}", format_count(actions.len(), "artifact"));
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Removes a pin.
-pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<ExitCode> {
+pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<()> {
     check_name(name)?;
     if session.store.unpin(name)? {
         print_line!("removed pin {name}");
-        return Ok(ExitCode::SUCCESS);
+        return Ok(());
     }
     let pins = session.store.pin_names()?;
     let known = known_names(name, pins.iter().map(String::as_str));

@@ -13,7 +13,7 @@ use stage::render_help;
 use store::Store;
 
 /// Writes a pipeline for a folder of posed photographs, and prints what was found.
-pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
+pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<()> {
     let starter = Starter::new(folder, file)?;
     print_line!("found: {}", starter.summary);
     print_line!("sizes: {}", starter.sizes);
@@ -33,7 +33,7 @@ pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
         count("experiments")
     );
     print_line!("`nerf-sr run` renders the views; `nerf-sr plan` shows the stages for this");
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Prints the help of a block's program, or of a program in the runner's folder. A program that
@@ -76,18 +76,16 @@ fn print_help(program: &Path) -> anyhow::Result<ExitCode> {
 }
 
 /// Writes man pages of the program and all its verbs into a folder.
-pub(crate) fn man(program: clap::Command, folder: &Path) -> anyhow::Result<ExitCode> {
+pub(crate) fn man(program: clap::Command, folder: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder)
         .and_then(|()| clap_mangen::generate_to(program, folder))
-        .with_context(|| format!("cannot write man pages into {}", folder.display()))?;
-    Ok(ExitCode::SUCCESS)
+        .with_context(|| format!("cannot write man pages into {}", folder.display()))
 }
 
 /// Prints a shell's completions for the program.
-pub(crate) fn completions(shell: clap_complete::Shell, program: &mut clap::Command) -> ExitCode {
+pub(crate) fn completions(shell: clap_complete::Shell, program: &mut clap::Command) {
     let mut script = Vec::new();
     clap_complete::generate(shell, program, "nerf-sr", &mut script);
     // A reader that closed the pipe early is no error.
     std::io::stdout().write_all(&script).ok();
-    ExitCode::SUCCESS
 }

@@ -1,7 +1,5 @@
 //! `plan`, `why` and `status` print the states of a plan's nodes.
 
-use std::process::ExitCode;
-
 use artifact::{format_count, format_duration, format_size, hash_json, print_line};
 use planning::{Request, State, short_hash};
 use store::Record;
@@ -13,7 +11,7 @@ use crate::session::{Session, nodes_of_stage};
 use crate::state_text::{age_text, blocking_nodes, by_scene_text, sink_text, state_text};
 
 /// Prints what `run` would do.
-pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::Result<ExitCode> {
+pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::Result<()> {
     let (plan, states) = session.plan_with_states(request)?;
     if json {
         return print_json(&PlanReport::new(session, &plan, &states, &[])?);
@@ -36,7 +34,7 @@ pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::
     if let Some(text) = estimates.total_text(stage::processors().count) {
         print_line!("{text}");
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Explains why a stage is cached, would run, or waits. For a sink, explains the stages that it
@@ -46,7 +44,7 @@ pub(crate) fn why(
     stage: &str,
     request: &Request,
     json: bool,
-) -> anyhow::Result<ExitCode> {
+) -> anyhow::Result<()> {
     let (plan, states) = session.plan_with_states(request)?;
     let records = session.store.records()?;
     if json {
@@ -62,7 +60,7 @@ pub(crate) fn why(
         for index in sink.nodes() {
             print_line!("  {}", explanation(index));
         }
-        return Ok(ExitCode::SUCCESS);
+        return Ok(());
     }
     for index in nodes_of_stage(&plan, stage)? {
         print_line!("{}", explanation(index));
@@ -73,11 +71,11 @@ pub(crate) fn why(
             print_line!("  {}", explanation(cause));
         }
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Prints every stage with its artifact, age and running time.
-pub(crate) fn status(session: &Session, request: &Request, json: bool) -> anyhow::Result<ExitCode> {
+pub(crate) fn status(session: &Session, request: &Request, json: bool) -> anyhow::Result<()> {
     let (plan, states) = session.plan_with_states(request)?;
     let (jobs, other_jobs) = session.jobs(&plan);
     if json {
@@ -106,7 +104,7 @@ pub(crate) fn status(session: &Session, request: &Request, json: bool) -> anyhow
         let jobs = format_count(other_jobs, "job");
         print_line!("also queued: {jobs}, for pages or for runs with other arguments");
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Returns hash, size, running time and age of a cached artifact.
