@@ -12,7 +12,7 @@
 //! * `garbage`: deletes the artifacts that nothing needs.
 //! * `estimates`: processor time of the stages to run.
 //! * `identities`: identities of nodes whose keys aren't known yet.
-//! * `node_report`: a plan's nodes as JSON. `state_text`: their states as text. `lineage` compares
+//! * `planned`: a plan's nodes with their states, as text; `node_report`: as JSON. `lineage` compares
 //!   two results and their inputs.
 //! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: gives the run's record (`run_record`) to stages that show it, such as the report, and
@@ -28,6 +28,7 @@ mod identities;
 mod lineage;
 mod node_report;
 mod page;
+mod planned;
 mod publish;
 mod run_messages;
 mod run_record;
@@ -35,7 +36,6 @@ mod session;
 mod sink;
 mod stage_inputs;
 mod starter;
-mod state_text;
 mod unchanged;
 mod verbs;
 mod waiting;

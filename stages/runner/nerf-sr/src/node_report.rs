@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use artifact::{RunInput, hash_json};
-use planning::{Change, Plan, State};
+use planning::{Change, State};
 use serde::Serialize;
 use serde_json::{Map, Value};
 use slurm::Job;
 use store::{Record, StoreError};
 
-use crate::session::Session;
+use crate::planned::Planned;
 
 /// A plan's nodes, each after its parents, and its sinks.
 #[derive(Debug, Serialize)]
@@ -81,16 +81,10 @@ pub(crate) struct ArtifactReport {
 
 impl PlanReport {
     /// Creates the report. With records, the nodes' `changes` are filled in.
-    pub(crate) fn new(
-        session: &Session,
-        plan: &Plan,
-        states: &[State],
-        records: &[Record],
-    ) -> Result<Self, StoreError> {
-        let nodes = states.iter().enumerate();
-        let nodes =
-            nodes.map(|(number, state)| NodeReport::new(session, plan, number, state, records));
-        let sinks = plan.sinks.iter().map(|sink| SinkReport {
+    pub(crate) fn new(planned: &Planned<'_>, records: &[Record]) -> Result<Self, StoreError> {
+        let nodes = 0..planned.states.len();
+        let nodes = nodes.map(|number| NodeReport::new(planned, number, records));
+        let sinks = planned.plan.sinks.iter().map(|sink| SinkReport {
             stage: sink.stage.clone(),
             shows: sink.nodes().into_iter().collect(),
         });
@@ -107,32 +101,26 @@ impl PlanReport {
 }
 
 impl NodeReport {
-    fn new(
-        session: &Session,
-        plan: &Plan,
-        number: usize,
-        state: &State,
-        records: &[Record],
-    ) -> Result<Self, StoreError> {
-        let (store, node) = (&session.store, &plan.nodes[number]);
+    fn new(planned: &Planned<'_>, number: usize, records: &[Record]) -> Result<Self, StoreError> {
+        let (node, state) = (&planned.plan.nodes[number], &planned.states[number]);
         let mut report = Self {
             number,
             stage: node.stage.clone(),
             point: node.point.clone(),
             state: state.name(),
             parameters: node.parameters.as_object().cloned().unwrap_or_default(),
+            by_scene: planned.scene_defaults(number),
             inputs: node.run_inputs(Some),
+            key: state.key(),
             ..Self::default()
         };
-        let mut folder = PathBuf::new();
         match state {
             State::Cached(record) => {
-                folder = store.object(&record.output);
-                report.key = Some(record.key());
+                let manifest = planned.store.manifest(&record.output);
                 report.artifact = Some(ArtifactReport {
                     output: record.output.clone(),
-                    folder: folder.clone(),
-                    bytes: store.manifest(&record.output).map_or(0, |manifest| manifest.size()),
+                    folder: planned.store.object(&record.output),
+                    bytes: manifest.map_or(0, |manifest| manifest.size()),
                     started_unix: record.started_unix,
                     seconds: record.seconds,
                     threads: record.threads,
@@ -141,14 +129,11 @@ impl NodeReport {
                 });
             }
             State::WillRun { key_parts } => {
-                let key = hash_json(key_parts);
-                report.has_checkpoint = store.has_checkpoint(&key)?;
+                report.has_checkpoint = planned.store.has_checkpoint(&hash_json(key_parts))?;
                 report.changes = planning::nearest_changes(key_parts, &node.stage, records);
-                report.key = Some(key);
             }
             State::Waits { on } => report.waits_on.clone_from(on),
         }
-        report.by_scene = node.scene_defaults(&folder);
         Ok(report)
     }
 }

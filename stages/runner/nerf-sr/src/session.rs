@@ -4,13 +4,14 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{Failure, report_text};
-use planning::{Describing, Devices, Origin, Pipeline, Plan, PlanError, Request, State};
+use planning::{Describing, Devices, Origin, Pipeline, Plan, PlanError, Request};
 use slurm::{Job, Queue, Slurm};
 use stage::check_device;
 use store::{RunFile, Store};
 
 use crate::estimates::Estimates;
 use crate::identities::node_identities;
+use crate::planned::Planned;
 use crate::stage_inputs;
 
 /// Pipeline, store and devices of a verb.
@@ -51,10 +52,10 @@ impl Session {
     }
 
     /// Creates a plan as [`Self::plan`] does, and finds the states of its nodes.
-    pub(crate) fn plan_with_states(&self, request: &Request) -> anyhow::Result<(Plan, Vec<State>)> {
+    pub(crate) fn plan_with_states(&self, request: &Request) -> anyhow::Result<Planned<'_>> {
         let plan = self.plan(request)?;
         let states = plan.states(&self.store, None)?;
-        Ok((plan, states))
+        Ok(Planned { store: &self.store, plan, states })
     }
 
     /// Creates a plan. `describing` states which programs may be started to describe themselves.

@@ -24,6 +24,7 @@ use store::{ModelCost, Record, Store, host_name};
 
 pub(crate) use text::{check_memory, comparison_text, run_text, total_comparison_text};
 
+use crate::planned::Planned;
 use costs::{min_memory, model_cost};
 use scene::SceneImages;
 use work::{Images, Work};
@@ -63,13 +64,14 @@ pub(crate) struct Estimates {
 
 impl Estimates {
     /// Estimates the nodes of a plan.
-    pub(crate) fn new(plan: &Plan, states: &[State], store: &Store) -> Self {
+    pub(crate) fn new(planned: &Planned<'_>) -> Self {
+        let Planned { plan, states, .. } = planned;
         let is_cached = |state: &State| matches!(state, State::Cached(_));
         if states.iter().all(is_cached) {
             // A run with nothing to do reads nothing.
             return Self::default();
         }
-        let estimator = Estimator::new(plan, states, store);
+        let estimator = Estimator::new(planned);
         let mut found = Self {
             nodes: vec![None; plan.nodes.len()],
             unknown: 0,
@@ -105,7 +107,8 @@ struct Estimator<'a> {
 }
 
 impl<'a> Estimator<'a> {
-    fn new(plan: &'a Plan, states: &[State], store: &Store) -> Self {
+    fn new(planned: &'a Planned<'_>) -> Self {
+        let Planned { store, plan, states } = planned;
         let mut scenes = BTreeMap::new();
         for (index, node) in plan.nodes.iter().enumerate() {
             if node.program.description.name == "prep"

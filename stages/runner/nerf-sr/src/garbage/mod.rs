@@ -22,7 +22,7 @@ use store::{Closed, Record, Store, StoreError};
 
 pub(crate) use roots::{Policy, Root};
 
-use crate::state_text::age_text;
+use crate::planned::age_text;
 use contents::{Contents, Kept};
 
 /// A garbage collection that is decided, but not carried out yet.

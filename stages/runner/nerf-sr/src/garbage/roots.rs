@@ -5,7 +5,7 @@ use slurm::{Queue, Slurm};
 use store::{PartialKey, Run, Store, StoreError};
 
 use crate::garbage::contents::Contents;
-use crate::state_text::age_text;
+use crate::planned::age_text;
 
 /// Actions to keep, with the reason.
 #[derive(Debug, Clone, Default)]

@@ -149,8 +149,8 @@ fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> &QualityCo
 fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Result<QualityCosts> {
     let mut request = request.clone();
     request.parameters.push(format!("quality={}", quality.name()));
-    let (plan, states) = session.plan_with_states(&request)?;
-    let estimates = Estimates::new(&plan, &states, &session.store);
+    let planned = session.plan_with_states(&request)?;
+    let estimates = Estimates::new(&planned);
     if quality == Quality::ALL[0] {
         for scene in &estimates.scenes {
             print_line!("{scene}");
@@ -165,7 +165,7 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
         excludes_refining: false,
     };
     for (index, estimate) in estimates.iter() {
-        let program = plan.nodes[index].program.description.name.as_str();
+        let program = planned.plan.nodes[index].program.description.name.as_str();
         costs.total.add(estimate.processor_seconds, estimate.memory);
         costs.min_memory = costs.min_memory.max(estimate.min_memory);
         if let Some(column) = COLUMNS.iter().position(|(_, names)| names.contains(&program)) {
@@ -173,7 +173,7 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
         }
     }
     if costs.parts[REFINING] == Cost::default()
-        && let Some(refining) = refining_cost(session, &request, &plan)
+        && let Some(refining) = refining_cost(session, &request, &planned.plan)
     {
         costs.parts[REFINING] = refining;
         costs.excludes_refining = true;
@@ -189,11 +189,11 @@ fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Co
     }
     let targets = vec![REFINING_TARGET.to_owned()];
     let request = Request { targets, ..request.clone() };
-    let (refined, refined_states) = session.plan_with_states(&request).ok()?;
-    let estimates = Estimates::new(&refined, &refined_states, &session.store);
+    let refined = session.plan_with_states(&request).ok()?;
+    let estimates = Estimates::new(&refined);
     let mut cost = Cost::default();
     for (index, estimate) in estimates.iter() {
-        let refined_node = &refined.nodes[index];
+        let refined_node = &refined.plan.nodes[index];
         let is_same =
             |node: &Node| (&node.stage, &node.point) == (&refined_node.stage, &refined_node.point);
         if !plan.nodes.iter().any(is_same) {

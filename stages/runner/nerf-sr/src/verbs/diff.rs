@@ -69,12 +69,12 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
 /// plan.
 fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let (stage, request) = stage_request(text)?;
-    let (plan, states) = session.plan_with_states(&request)?;
-    let nodes = nodes_of_stage(&plan, &stage)?;
+    let planned = session.plan_with_states(&request)?;
+    let nodes = nodes_of_stage(&planned.plan, &stage)?;
     let &[index] = nodes.as_slice() else {
         return Err(usage(text, "a sweep has several results; give one value for each parameter"));
     };
-    let State::Cached(record) = &states[index] else {
+    let State::Cached(record) = &planned.states[index] else {
         bail_bad_input!("{text} has no artifact yet; run it first");
     };
     Lineage::read(&session.store, [record.key()])

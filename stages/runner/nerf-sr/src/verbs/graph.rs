@@ -17,8 +17,8 @@ pub(crate) fn graph(
     request: &Request,
     format: GraphFormat,
 ) -> anyhow::Result<()> {
-    let (plan, states) = session.plan_with_states(request)?;
-    let vertices = vertices(&plan, &states);
+    let planned = session.plan_with_states(request)?;
+    let vertices = vertices(&planned.plan, &planned.states);
     print_lines(&match format {
         GraphFormat::Text => draw_as_text(&vertices),
         GraphFormat::Dot => draw_for_graphviz(&vertices),

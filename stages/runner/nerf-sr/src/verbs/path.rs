@@ -19,10 +19,10 @@ pub(crate) fn path(session: &Session, stage_path: &str, request: &Request) -> an
     if request.targets.is_empty() {
         request.targets.push(stage.to_owned());
     }
-    let (plan, states) = session.plan_with_states(&request)?;
-    for index in nodes_of_stage(&plan, stage)? {
-        let State::Cached(record) = &states[index] else {
-            let label = plan.nodes[index].label();
+    let planned = session.plan_with_states(&request)?;
+    for index in nodes_of_stage(&planned.plan, stage)? {
+        let State::Cached(record) = &planned.states[index] else {
+            let label = planned.plan.nodes[index].label();
             bail_bad_input!("{label} has no artifact yet; run it first");
         };
         let mut path = session.store.object(&record.output);

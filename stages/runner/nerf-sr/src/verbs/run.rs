@@ -9,6 +9,7 @@ use store::{RunFile, Store};
 
 use crate::estimates::Estimates;
 use crate::execute::Executor;
+use crate::planned::Planned;
 use crate::session::{Run, Session, check_not_in_input, command_line};
 use crate::waiting::enter_store;
 
@@ -25,8 +26,9 @@ pub(crate) fn run(
     plan.check_folders()?;
     let (file, states) = begin_run(&session.store, &plan, &stop)?;
     let store = &session.store;
-    let estimates = &Estimates::new(&plan, &states, store);
-    let run = Run { plan: &plan, store, file: &file, out, estimates, stop: &stop };
+    let planned = Planned { store, plan, states };
+    let estimates = &Estimates::new(&planned);
+    let run = Run { plan: &planned.plan, store, file: &file, out, estimates, stop: &stop };
     let result = executor.carry_out(&run);
     // If the end can't be recorded, as on a full disk, the run's age is counted from its start.
     file.end().ok();
