@@ -18,10 +18,9 @@ use std::sync::atomic::AtomicBool;
 use anyhow::{Context as _, anyhow};
 use artifact::{Manifest, list_files};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
-use store::{Locked, StoreError, is_lock_acquired};
 
 use crate::page::{PageMark, archive_path, check_ownership};
-use crate::waiting::wait_for_lock;
+use crate::waiting::lock_file;
 
 /// True if the target is a page with this identity and all its files, and a killed publishing left
 /// nothing of value next to it.
@@ -47,7 +46,9 @@ pub(crate) fn publish(
 ) -> anyhow::Result<Vec<PathBuf>> {
     let out = target.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(out).with_context(|| out.display().to_string())?;
-    let _lock = lock_folder(out, stop)?;
+    // Runs with different stores may publish into the same folder, so the store's locks aren't
+    // enough.
+    let _lock = lock_file(out, File::options().read(true), stop)?;
     let mark = PageMark::read(output).with_context(|| output.display().to_string())?;
     let publishing = Publishing { target, kind, mark: mark.unwrap_or_default() };
     let result = publishing.run(output);
@@ -197,20 +198,6 @@ impl Publishing<'_> {
 fn hidden(target: &Path, suffix: &str) -> PathBuf {
     let name = target.file_name().unwrap_or_default().to_string_lossy();
     target.with_file_name(format!(".{name}.nerf-sr-{suffix}"))
-}
-
-/// Locks a folder of pages. Runs with different stores may publish into the same folder, so the
-/// store's locks aren't enough.
-fn lock_folder(folder: &Path, stop: &AtomicBool) -> anyhow::Result<File> {
-    wait_for_lock(stop, "pages are being written", &|_| {}, || {
-        let file = File::open(folder)
-            .map_err(|source| StoreError::Io { path: folder.to_path_buf(), source })?;
-        Ok(if is_lock_acquired(folder, file.try_lock())? {
-            Locked::Acquired(file)
-        } else {
-            Locked::HeldBy(None)
-        })
-    })
 }
 
 /// Copies a folder and syncs its files, so that a full disk is noticed before a page is replaced.

@@ -1,10 +1,12 @@
 //! Waits for locks. Each wait reports the lock's holder and ends on a signal.
 
+use std::fs::{File, OpenOptions};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{Failure, format_duration};
-use store::{Entered, Holder, Locked, Store, StoreError, host_name};
+use store::{Entered, Holder, Locked, Store, StoreError, host_name, is_lock_acquired};
 
 /// Interval between two attempts to lock; chosen by hand.
 const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
@@ -48,6 +50,21 @@ pub(crate) fn enter_store(
     report: &dyn Fn(&str),
 ) -> anyhow::Result<Entered> {
     wait_for_lock(stop, "garbage is being collected", report, || store.try_enter())
+}
+
+/// Opens and locks a file or folder outside the store; waits while another process holds the lock.
+pub(crate) fn lock_file(
+    path: &Path,
+    options: &OpenOptions,
+    stop: &AtomicBool,
+) -> anyhow::Result<File> {
+    wait_for_lock(stop, "another run is writing", &|_| {}, || {
+        let file = options
+            .open(path)
+            .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
+        let is_acquired = is_lock_acquired(path, file.try_lock())?;
+        Ok(if is_acquired { Locked::Acquired(file) } else { Locked::HeldBy(None) })
+    })
 }
 
 /// Enters the store, or fails if garbage collection runs.

@@ -42,7 +42,7 @@ pub use commands::{Slurm, current_job_id};
 pub use queue::{Job, Queue};
 pub use resources::Resources;
 pub use site::Site;
-pub use submission::{Submission, Task, list_submissions, newest_logs};
+pub use submission::{Submission, Task, list_submissions, lock_path, newest_logs};
 pub use submit::{SubmitOptions, Submitted};
 
 /// Error of a call of Slurm, of a file of a submission or site, or of an amount's text.

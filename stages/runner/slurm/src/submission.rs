@@ -1,9 +1,8 @@
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
-use std::fs::{self, File, TryLockError};
+use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
@@ -48,9 +47,6 @@ pub struct Submission {
 
 const TASKS: &str = "tasks.json";
 const SCRIPT: &str = "job.sh";
-
-/// Interval between two attempts to lock.
-const ATTEMPT_INTERVAL: Duration = Duration::from_millis(50);
 
 impl Submission {
     /// Creates a submission in memory; [`Self::submit`] writes its folder.
@@ -139,25 +135,10 @@ pub fn newest_logs(root: &Path) -> Result<BTreeMap<String, PathBuf>, SlurmError>
     Ok(logs)
 }
 
-/// Locks a store's submissions, so that two processes don't submit the same task. `None` if
-/// `is_stopped` became true first.
-pub(crate) fn lock_submissions(
-    root: &Path,
-    is_stopped: &dyn Fn() -> bool,
-) -> Result<Option<File>, SlurmError> {
-    let folder = root.join("slurm");
-    let path = folder.join("lock");
-    let file = fs::create_dir_all(&folder)
-        .and_then(|()| File::options().create(true).append(true).open(&path))
-        .map_err(|e| SlurmError::file(&path, e))?;
-    loop {
-        match file.try_lock() {
-            Ok(()) => return Ok(Some(file)),
-            Err(TryLockError::WouldBlock) if is_stopped() => return Ok(None),
-            Err(TryLockError::WouldBlock) => std::thread::sleep(ATTEMPT_INTERVAL),
-            Err(TryLockError::Error(error)) => return Err(SlurmError::file(&path, error)),
-        }
-    }
+/// Returns the path of the file that a process locks while it submits, so that two processes don't
+/// submit the same task.
+pub fn lock_path(root: &Path) -> PathBuf {
+    root.join("slurm/lock")
 }
 
 #[cfg(test)]
@@ -191,14 +172,5 @@ mod tests {
         let logs = newest_logs(root.path()).unwrap();
         assert_eq!(logs.keys().collect::<Vec<_>>(), ["a", "b"], "x has no log");
         assert!(logs["b"].ends_with("slurm/b/1.log"));
-    }
-
-    #[test]
-    fn only_one_process_submits_at_a_time() {
-        let root = tempfile::tempdir().unwrap();
-        let lock = lock_submissions(root.path(), &|| false).unwrap();
-        assert!(lock.is_some() && lock_submissions(root.path(), &|| true).unwrap().is_none());
-        drop(lock);
-        assert!(lock_submissions(root.path(), &|| true).unwrap().is_some());
     }
 }

@@ -6,7 +6,7 @@ use crate::SlurmError;
 use crate::commands::Slurm;
 use crate::queue::Queue;
 use crate::site::Site;
-use crate::submission::{Submission, lock_submissions};
+use crate::submission::Submission;
 
 /// Options of [`Submission::submit`].
 pub struct SubmitOptions<'a> {
@@ -42,16 +42,13 @@ impl Submission {
     /// Submits a job for each task that is neither done nor queued. `find_done` returns a flag per
     /// task, true if the task is done. `find_done` is called after the queue is read, so that a
     /// task that ends in between counts as done. The submission's folder is written before the
-    /// first job; without jobs, no folder is written.
+    /// first job; without jobs, no folder is written. The caller has locked [`crate::lock_path`].
     pub fn submit<E: From<SlurmError>>(
         &self,
         root: &Path,
         options: &SubmitOptions<'_>,
         find_done: impl FnOnce() -> Result<Vec<bool>, E>,
     ) -> Result<Submitted, E> {
-        let Some(_lock) = lock_submissions(root, options.is_stopped)? else {
-            return Ok(Submitted { remaining: self.tasks.len(), ..Submitted::default() });
-        };
         let queue = Queue::read(options.slurm, root)?;
         let done = find_done()?;
         let mut submitted = Submitted::default();

@@ -1,6 +1,7 @@
 //! The Slurm executor: submits a job for each node that isn't cached and for each sink, then exits
 //! (docs/design/032).
 
+use std::fs::{self, File};
 use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::Ordering;
@@ -17,6 +18,7 @@ use crate::identities::node_identities;
 use crate::run_messages;
 use crate::session::{Run, check_utf8_path};
 use crate::sink::{is_up_to_date, sink_parts};
+use crate::waiting::lock_file;
 
 /// The verb that a job calls.
 pub(crate) const JOB_VERB: &str = "job";
@@ -49,6 +51,9 @@ impl Executor for Cluster {
             working_folder: &std::env::current_dir()?,
             is_stopped: &|| run.stop.load(Ordering::Relaxed),
         };
+        let lock = slurm::lock_path(root);
+        fs::create_dir_all(root.join("slurm")).with_context(|| lock.display().to_string())?;
+        let _lock = lock_file(&lock, File::options().create(true).append(true), run.stop)?;
         let submitted = submission.submit(root, &options, || find_done(run, &out))?;
         self.report(run, &submission, &submitted)
     }
