@@ -13,7 +13,7 @@ use clap::{Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::{Memory, Site};
 
-use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
+use crate::execute::{Budget, Cluster, JOB_VERB, Local};
 use crate::garbage::Policy;
 use crate::session::Session;
 use crate::verbs::{self, GraphFormat, Limits};
@@ -346,9 +346,29 @@ pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
 
 fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Result<ExitCode> {
     let session = global.open_session()?;
-    let out = options.out.clone().unwrap_or_else(|| session.pipeline.project_folder().join("out"));
-    let executor = new_executor(global.executor, options, global.plan_arguments(&plan), &out)?;
-    verbs::run(&session, &plan.into(), &out, executor.as_ref())
+    let plan_arguments = global.plan_arguments(&plan);
+    let request = Request::from(plan);
+    let RunOptions { jobs, threads, memory, keep_going, out, watch, site } = options;
+    let out = out.unwrap_or_else(|| session.pipeline.project_folder().join("out"));
+    if global.executor == ExecutorKind::Local {
+        let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
+        let budget = Budget::new(jobs, threads, memory.map(Memory::bytes));
+        let executor = Local { budget, keep_going, plan_arguments, watch };
+        return verbs::run(&session, &request, &out, &executor);
+    }
+    if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
+        bail_usage!(
+            "--jobs, --threads, --memory and --keep-going need --executor local; on a cluster, set \
+            `resources` in the pipeline"
+        );
+    }
+    if watch.is_some() {
+        bail_usage!(
+            "--watch needs --executor local: on a cluster, the runner exits before jobs run"
+        );
+    }
+    let site = Site::find(site.as_deref()).map_err(|e| Failure::Usage(e.to_string()))?;
+    verbs::run(&session, &request, &out, &Cluster { site })
 }
 
 impl GlobalArgs {
@@ -386,34 +406,6 @@ impl GlobalArgs {
 
 fn positive_count(text: &str) -> Result<NonZeroUsize, String> {
     text.parse().map_err(|_| "expected a whole number of at least 1".to_owned())
-}
-
-/// Creates the executor of a run. Watched views are written below `out`.
-fn new_executor(
-    kind: ExecutorKind,
-    options: RunOptions,
-    plan_arguments: Vec<String>,
-    out: &Path,
-) -> Result<Box<dyn Executor>, Failure> {
-    let RunOptions { jobs, threads, memory, keep_going, site, watch, .. } = options;
-    if kind == ExecutorKind::Local {
-        let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
-        let budget = Budget::new(jobs, threads, memory.map(Memory::bytes));
-        return Ok(Box::new(Local { budget, keep_going, plan_arguments, watch }));
-    }
-    if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
-        bail_usage!(
-            "--jobs, --threads, --memory and --keep-going need --executor local; on a cluster, set \
-            `resources` in the pipeline"
-        );
-    }
-    if watch.is_some() {
-        bail_usage!(
-            "--watch needs --executor local: on a cluster, the runner exits before jobs run"
-        );
-    }
-    let site = Site::find(site.as_deref()).map_err(|e| Failure::Usage(e.to_string()))?;
-    Ok(Box::new(Cluster { site }))
 }
 
 #[cfg(test)]

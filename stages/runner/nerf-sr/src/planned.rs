@@ -43,27 +43,23 @@ impl Planned<'_> {
             }
             (State::WillRun { .. }, None) => "will run".to_owned(),
             (State::WillRun { key_parts }, Some(records)) => {
-                self.reason_to_run(key_parts, &self.plan.nodes[index].stage, records)
+                match planning::explain(key_parts, &self.plan.nodes[index].stage, records) {
+                    None => "will run: no earlier run of this stage".to_owned(),
+                    Some(changes) if changes.is_empty() => self.missing_text(key_parts),
+                    Some(changes) => format!("will run: {}", changes.join("; ")),
+                }
             }
         }
     }
 
-    fn reason_to_run(
-        &self,
-        key_parts: &Map<String, Value>,
-        stage: &str,
-        records: &[Record],
-    ) -> String {
-        match planning::explain(key_parts, stage, records) {
-            None => "will run: no earlier run of this stage".to_owned(),
-            Some(changes) if changes.is_empty() => match self.store.record(&hash_json(key_parts)) {
-                Ok(Some(record)) => {
-                    let output = short_hash(&record.output);
-                    format!("will run: its artifact {output} is missing or incomplete")
-                }
-                _ => "will run".to_owned(),
-            },
-            Some(changes) => format!("will run: {}", changes.join("; ")),
+    /// Describes the state of a node that will run, although a record has its key.
+    fn missing_text(&self, key_parts: &Map<String, Value>) -> String {
+        match self.store.record(&hash_json(key_parts)) {
+            Ok(Some(record)) => {
+                let output = short_hash(&record.output);
+                format!("will run: its artifact {output} is missing or incomplete")
+            }
+            _ => "will run".to_owned(),
         }
     }
 

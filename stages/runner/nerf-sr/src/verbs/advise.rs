@@ -1,10 +1,10 @@
 //! `advise` estimates time and memory of each quality.
 
 use artifact::{format_count, format_duration, format_size, print_line};
-use planning::{Node, Plan, Quality, Request};
+use planning::{Plan, Quality, Request};
 use slurm::Memory;
 
-use crate::estimates::Estimates;
+use crate::estimates::{Estimate, Estimates};
 use crate::run_messages::command_text;
 use crate::session::Session;
 
@@ -59,9 +59,14 @@ const COLUMNS: [(&str, &[&str]); 4] = [
 const REFINING: usize = COLUMNS.len() - 1;
 
 impl Cost {
-    fn add(&mut self, seconds: f64, memory: u64) {
-        self.seconds += seconds;
-        self.memory = self.memory.max(memory);
+    /// Returns the cost of some stages.
+    fn of<'a>(estimates: impl Iterator<Item = &'a Estimate>) -> Self {
+        let mut cost = Self::default();
+        for estimate in estimates {
+            cost.seconds += estimate.processor_seconds;
+            cost.memory = cost.memory.max(estimate.memory);
+        }
+        cost
     }
 
     /// Returns the time on some processors, and the memory.
@@ -156,29 +161,27 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
             print_line!("{scene}");
         }
     }
-    let mut costs = QualityCosts {
-        quality,
-        parts: [Cost::default(); COLUMNS.len()],
-        total: Cost::default(),
-        min_memory: 0,
-        unknown: estimates.unknown,
-        excludes_refining: false,
-    };
-    for (index, estimate) in estimates.iter() {
-        let program = planned.plan.nodes[index].program.description.name.as_str();
-        costs.total.add(estimate.processor_seconds, estimate.memory);
-        costs.min_memory = costs.min_memory.max(estimate.min_memory);
-        if let Some(column) = COLUMNS.iter().position(|(_, names)| names.contains(&program)) {
-            costs.parts[column].add(estimate.processor_seconds, estimate.memory);
-        }
-    }
-    if costs.parts[REFINING] == Cost::default()
+    let program = |index: usize| planned.plan.nodes[index].program.description.name.as_str();
+    let mut parts = COLUMNS.map(|(_, names)| {
+        let of_column = estimates.iter().filter(|(index, _)| names.contains(&program(*index)));
+        Cost::of(of_column.map(|(_, estimate)| estimate))
+    });
+    let mut excludes_refining = false;
+    if parts[REFINING] == Cost::default()
         && let Some(refining) = refining_cost(session, &request, &planned.plan)
     {
-        costs.parts[REFINING] = refining;
-        costs.excludes_refining = true;
+        parts[REFINING] = refining;
+        excludes_refining = true;
     }
-    Ok(costs)
+    let all = || estimates.iter().map(|(_, estimate)| estimate);
+    Ok(QualityCosts {
+        quality,
+        parts,
+        total: Cost::of(all()),
+        min_memory: all().map(|estimate| estimate.min_memory).max().unwrap_or(0),
+        unknown: estimates.unknown,
+        excludes_refining,
+    })
 }
 
 /// Returns the additional cost of refining the views of a plan; `None` if the request names
@@ -191,16 +194,12 @@ fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Co
     let request = Request { targets, ..request.clone() };
     let refined = session.plan_with_states(&request).ok()?;
     let estimates = Estimates::new(&refined);
-    let mut cost = Cost::default();
-    for (index, estimate) in estimates.iter() {
-        let refined_node = &refined.plan.nodes[index];
-        let is_same =
-            |node: &Node| (&node.stage, &node.point) == (&refined_node.stage, &refined_node.point);
-        if !plan.nodes.iter().any(is_same) {
-            cost.add(estimate.processor_seconds, estimate.memory);
-        }
-    }
-    Some(cost)
+    let is_new = |index: usize| {
+        let new = &refined.plan.nodes[index];
+        !plan.nodes.iter().any(|node| (&node.stage, &node.point) == (&new.stage, &new.point))
+    };
+    let added = estimates.iter().filter(|(index, _)| is_new(*index));
+    Some(Cost::of(added.map(|(_, estimate)| estimate)))
 }
 
 #[cfg(test)]
