@@ -16,7 +16,9 @@ use slurm::{Memory, Site};
 use crate::execute::{Budget, Cluster, JOB_VERB, Local};
 use crate::garbage::Policy;
 use crate::session::Session;
-use crate::verbs::{self, GraphFormat, Limits};
+use crate::verbs;
+use crate::verbs::advise::Limits;
+use crate::verbs::graph::GraphFormat;
 use crate::watch::Watch;
 
 const DEFAULT_PIPELINE: &str = "pipeline.yaml";
@@ -306,39 +308,36 @@ pub(crate) fn plan_request(words: impl Iterator<Item = String>) -> Result<Reques
 /// Parses the command line and carries out its verb.
 pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
     let Cli { verb, global } = Cli::parse();
+    let session = || global.open_session();
     match verb {
         Verb::Run { plan, options } => return run(&global, plan, options),
-        Verb::Job { submission, number } => return verbs::job(&submission, number),
-        Verb::Verify { remove } => return verbs::verify(&global.open_session()?.store, remove),
+        Verb::Job { submission, number } => return verbs::jobs::job(&submission, number),
+        Verb::Verify { remove } => return verbs::verify::verify(&session()?.store, remove),
         Verb::Describe { stage } => {
             let pipeline = Pipeline::read(&global.pipeline).map_err(PlanError::from)?;
-            return verbs::describe(&pipeline, &stage, || Ok(global.open_session()?.store));
+            return verbs::standalone::describe(&pipeline, &stage, || Ok(session()?.store));
         }
-        Verb::Init { folder } => verbs::init(&folder, &global.pipeline)?,
-        Verb::Man { folder } => verbs::man(Cli::command(), &folder)?,
-        Verb::Completions { shell } => verbs::completions(shell, &mut Cli::command()),
-        Verb::Cancel { stage } => verbs::cancel(&global.open_session()?.store, stage.as_deref())?,
-        Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json)?,
+        Verb::Init { folder } => verbs::standalone::init(&folder, &global.pipeline)?,
+        Verb::Man { folder } => verbs::standalone::man(Cli::command(), &folder)?,
+        Verb::Completions { shell } => verbs::standalone::completions(shell, &mut Cli::command()),
+        Verb::Cancel { stage } => verbs::jobs::cancel(&session()?.store, stage.as_deref())?,
+        Verb::Plan { plan, json } => verbs::states::plan(&session()?, &plan.into(), json)?,
         Verb::Advise { plan, limits } => {
             let arguments = global.plan_arguments(&plan);
-            verbs::advise(&global.open_session()?, &plan.into(), limits, &arguments)?;
+            verbs::advise::advise(&session()?, &plan.into(), limits, &arguments)?;
         }
         Verb::Why { stage, plan, json } => {
-            verbs::why(&global.open_session()?, &stage, &plan.into(), json)?;
+            verbs::states::why(&session()?, &stage, &plan.into(), json)?;
         }
-        Verb::Status { plan, json } => verbs::status(&global.open_session()?, &plan.into(), json)?,
-        Verb::Path { stage, plan } => verbs::path(&global.open_session()?, &stage, &plan.into())?,
-        Verb::Diff { before, now, json } => {
-            verbs::diff(&global.open_session()?, &before, &now, json)?;
-        }
-        Verb::Graph { plan, format } => {
-            verbs::graph(&global.open_session()?, &plan.into(), format)?;
-        }
-        Verb::Log { stage, plan } => verbs::log(&global.open_session()?, &stage, &plan.into())?,
-        Verb::Pin { name, plan } => verbs::pin(&global.open_session()?, &name, &plan.into())?,
-        Verb::Unpin { name } => verbs::unpin(&global.open_session()?, &name)?,
+        Verb::Status { plan, json } => verbs::states::status(&session()?, &plan.into(), json)?,
+        Verb::Path { stage, plan } => verbs::path::path(&session()?, &stage, &plan.into())?,
+        Verb::Diff { before, now, json } => verbs::diff::diff(&session()?, &before, &now, json)?,
+        Verb::Graph { plan, format } => verbs::graph::graph(&session()?, &plan.into(), format)?,
+        Verb::Log { stage, plan } => verbs::log::log(&session()?, &stage, &plan.into())?,
+        Verb::Pin { name, plan } => verbs::pin::pin(&session()?, &name, &plan.into())?,
+        Verb::Unpin { name } => verbs::pin::unpin(&session()?, &name)?,
         Verb::Gc { plan, dry_run, policy, json } => {
-            verbs::gc(&global.open_session()?, &plan.into(), policy, dry_run, json)?;
+            verbs::gc::gc(&session()?, &plan.into(), policy, dry_run, json)?;
         }
     }
     Ok(ExitCode::SUCCESS)
@@ -354,7 +353,7 @@ fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Resu
         let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
         let budget = Budget::new(jobs, threads, memory.map(Memory::bytes));
         let executor = Local { budget, keep_going, plan_arguments, watch };
-        return verbs::run(&session, &request, &out, &executor);
+        return verbs::run::run(&session, &request, &out, &executor);
     }
     if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
         bail_usage!(
@@ -368,7 +367,7 @@ fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Resu
         );
     }
     let site = Site::find(site.as_deref()).map_err(|e| Failure::Usage(e.to_string()))?;
-    verbs::run(&session, &request, &out, &Cluster { site })
+    verbs::run::run(&session, &request, &out, &Cluster { site })
 }
 
 impl GlobalArgs {

@@ -11,7 +11,6 @@
 //!   `waiting` waits for locks; `run_messages` has the messages at the end of a run.
 //! * `garbage`: deletes the artifacts that nothing needs.
 //! * `estimates`: processor time of the stages to run.
-//! * `identities`: identities of nodes whose keys aren't known yet.
 //! * `planned`: a plan's nodes with their states, as text; `node_report`: as JSON. `lineage` compares
 //!   two results and their inputs.
 //! * `watch`: shows one test view of a field while the field trains.
@@ -24,7 +23,6 @@ mod cli;
 mod estimates;
 mod execute;
 mod garbage;
-mod identities;
 mod lineage;
 mod node_report;
 mod page;

@@ -3,14 +3,13 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, report_text};
-use planning::{Describing, Devices, Origin, Pipeline, Plan, PlanError, Request};
+use artifact::{Failure, hash_json, report_text};
+use planning::{Describing, Devices, Origin, Pipeline, Plan, PlanError, Request, read_source};
 use slurm::{Job, Queue, Slurm};
 use stage::check_device;
 use store::{RunFile, Store};
 
 use crate::estimates::Estimates;
-use crate::identities::node_identities;
 use crate::planned::Planned;
 use crate::stage_inputs;
 
@@ -191,4 +190,30 @@ pub(crate) fn nodes_of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, Pla
     let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
     let known = artifact::known_names(stage, known);
     Err(PlanError::Usage(format!("no stage {stage:?} in this plan; {known}")))
+}
+
+/// Computes identities of nodes whose keys may not be known yet: hashes of the key's parts, with
+/// parents' identities instead of their outputs (docs/design/032). Fails soon after `stop` is set.
+pub(crate) fn node_identities(
+    plan: &Plan,
+    store: &Store,
+    stop: Option<&AtomicBool>,
+) -> Result<Vec<String>, PlanError> {
+    let mut identities: Vec<String> = Vec::with_capacity(plan.nodes.len());
+    for node in &plan.nodes {
+        let mut inputs = Vec::new();
+        for input in &node.inputs {
+            let content = match &input.from {
+                Origin::Node { index, subtree } => {
+                    format!("{}/{}", identities[*index], subtree.as_deref().unwrap_or_default())
+                }
+                Origin::Folder(folder) => {
+                    read_source(store, node, &input.name, folder, stop)?.content_hash()
+                }
+            };
+            inputs.push((input.name.clone(), content));
+        }
+        identities.push(hash_json(&planning::key_parts(node, &inputs, plan.device(&node.stage))));
+    }
+    Ok(identities)
 }

@@ -53,9 +53,9 @@ pub(crate) struct Estimate {
 /// Estimates for the nodes of a plan that aren't cached.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Estimates {
-    /// Estimates by node index; `None` for cached nodes, stages without a model, and scenes that
+    /// Estimates by node index; none for cached nodes, stages without a model, and scenes that
     /// aren't known yet.
-    nodes: Vec<Option<Estimate>>,
+    pub(crate) nodes: BTreeMap<usize, Estimate>,
     /// Number of nodes that aren't cached and have no estimate.
     pub(crate) unknown: usize,
     /// Descriptions of the plan's scenes.
@@ -72,26 +72,16 @@ impl Estimates {
             return Self::default();
         }
         let estimator = Estimator::new(planned);
-        let mut found = Self {
-            nodes: vec![None; plan.nodes.len()],
-            unknown: 0,
-            scenes: estimator.scenes.values().map(SceneImages::summary).collect(),
-        };
-        for (index, state) in states.iter().enumerate().filter(|(_, state)| !is_cached(state)) {
-            found.nodes[index] = estimator.estimate(&plan.nodes[index], state);
-            found.unknown += usize::from(found.nodes[index].is_none());
-        }
-        found
-    }
-
-    /// Returns the estimate of a node.
-    pub(crate) fn get(&self, index: usize) -> Option<&Estimate> {
-        self.nodes.get(index)?.as_ref()
-    }
-
-    /// Returns all estimates, with node indices.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (usize, &Estimate)> {
-        self.nodes.iter().enumerate().filter_map(|(index, node)| Some((index, node.as_ref()?)))
+        let missing = states.iter().enumerate().filter(|(_, state)| !is_cached(state));
+        let nodes: BTreeMap<usize, Estimate> = missing
+            .clone()
+            .filter_map(|(index, state)| {
+                Some((index, estimator.estimate(&plan.nodes[index], state)?))
+            })
+            .collect();
+        let unknown = missing.count() - nodes.len();
+        let scenes = estimator.scenes.values().map(SceneImages::summary).collect();
+        Self { nodes, unknown, scenes }
     }
 }
 

@@ -214,7 +214,7 @@ impl<'a> Schedule<'a> {
             .collect();
         let threads = self.options.budget.cores;
         let (run, display) = (self.run, self.display);
-        let estimate = run.estimates.get(index).copied();
+        let estimate = run.estimates.nodes.get(&index).copied();
         NodeJob { run, node, parents, threads, display, estimate, watch: None }
     }
 

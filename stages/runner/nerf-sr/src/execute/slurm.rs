@@ -14,9 +14,8 @@ use slurm::{Site, Slurm, Submission, SubmitOptions, Submitted, Task};
 use store::Record;
 
 use super::Executor;
-use crate::identities::node_identities;
 use crate::run_messages;
-use crate::session::{Run, check_utf8_path};
+use crate::session::{Run, check_utf8_path, node_identities};
 use crate::sink::{is_up_to_date, sink_parts};
 use crate::waiting::lock_file;
 

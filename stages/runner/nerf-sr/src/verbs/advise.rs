@@ -161,9 +161,9 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
             print_line!("{scene}");
         }
     }
-    let program = |index: usize| planned.plan.nodes[index].program.description.name.as_str();
+    let program = |index: &usize| planned.plan.nodes[*index].program.description.name.as_str();
     let mut parts = COLUMNS.map(|(_, names)| {
-        let of_column = estimates.iter().filter(|(index, _)| names.contains(&program(*index)));
+        let of_column = estimates.nodes.iter().filter(|(index, _)| names.contains(&program(index)));
         Cost::of(of_column.map(|(_, estimate)| estimate))
     });
     let mut excludes_refining = false;
@@ -173,7 +173,7 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
         parts[REFINING] = refining;
         excludes_refining = true;
     }
-    let all = || estimates.iter().map(|(_, estimate)| estimate);
+    let all = || estimates.nodes.values();
     Ok(QualityCosts {
         quality,
         parts,
@@ -194,11 +194,11 @@ fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Co
     let request = Request { targets, ..request.clone() };
     let refined = session.plan_with_states(&request).ok()?;
     let estimates = Estimates::new(&refined);
-    let is_new = |index: usize| {
-        let new = &refined.plan.nodes[index];
+    let is_new = |index: &usize| {
+        let new = &refined.plan.nodes[*index];
         !plan.nodes.iter().any(|node| (&node.stage, &node.point) == (&new.stage, &new.point))
     };
-    let added = estimates.iter().filter(|(index, _)| is_new(*index));
+    let added = estimates.nodes.iter().filter(|(index, _)| is_new(index));
     Some(Cost::of(added.map(|(_, estimate)| estimate)))
 }
 

@@ -8,8 +8,7 @@ use planning::{Plan, PlanError, Request, State};
 
 use store::{Store, StoreError};
 
-use crate::identities::node_identities;
-use crate::session::{Session, nodes_of_stage};
+use crate::session::{Session, node_identities, nodes_of_stage};
 
 /// Prints the logs of a stage's nodes, or the log of the stage's last run with any arguments.
 pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::Result<()> {

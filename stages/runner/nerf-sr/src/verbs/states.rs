@@ -18,7 +18,7 @@ pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::
     let estimates = Estimates::new(&planned);
     for (index, node) in planned.plan.nodes.iter().enumerate() {
         let mut text = planned.state_text(index, None);
-        if let Some(estimate) = estimates.get(index) {
+        if let Some(estimate) = estimates.nodes.get(&index) {
             text += &format!("; about {}", estimate.text());
         }
         print_line!("{:<40} {text}", node.label());
