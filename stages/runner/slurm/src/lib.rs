@@ -26,11 +26,9 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod amounts;
-mod arguments;
 mod commands;
 mod queue;
 mod resources;
-mod script;
 mod site;
 mod submission;
 mod submit;
