@@ -12,15 +12,15 @@ use crate::session::Run;
 
 /// Progress of a run; by default, that before its first stage.
 #[derive(Default)]
-pub(crate) struct RunProgress<'a> {
+pub(crate) struct RunProgress {
     /// Records by node index; `None` if the node isn't done.
-    pub(crate) records: &'a [Option<Record>],
+    pub(crate) records: Vec<Option<Record>>,
     /// Nodes that ran; `None` if unknown.
-    pub(crate) ran: Option<&'a BTreeSet<usize>>,
+    pub(crate) ran: Option<BTreeSet<usize>>,
     /// Nodes that failed.
-    pub(crate) failures: &'a [(usize, StageFailure)],
+    pub(crate) failures: Vec<(usize, StageFailure)>,
     /// Command line of the run.
-    pub(crate) command: &'a [String],
+    pub(crate) command: Vec<String>,
 }
 
 /// Returns the record of the nodes that a sink shows and of their ancestors, and the indices of the
@@ -30,7 +30,7 @@ pub(crate) struct RunProgress<'a> {
 pub(crate) fn run_record(
     run: &Run<'_>,
     sink: &Sink,
-    progress: &RunProgress<'_>,
+    progress: &RunProgress,
 ) -> Option<(RunRecord, Vec<usize>)> {
     let plan = run.plan;
     let mut is_complete: Vec<bool> = Vec::with_capacity(plan.nodes.len());
@@ -147,7 +147,7 @@ fn unfinished_node(
     index: usize,
     done: &[usize],
     undone: &[usize],
-    progress: &RunProgress<'_>,
+    progress: &RunProgress,
 ) -> UnfinishedNode {
     let node = &plan.nodes[index];
     // Numbers of a record's nodes: done ones first.
@@ -205,13 +205,13 @@ pub(crate) fn add_details(
     record: &mut RunRecord,
     plan: &Plan,
     indices: &[usize],
-    progress: &RunProgress<'_>,
+    progress: &RunProgress,
 ) {
     for (node, index) in record.nodes.iter_mut().zip(indices) {
         node.resolved = plan.nodes[*index].scene_defaults(&node.folder);
-        node.is_cached = progress.ran.map(|ran| !ran.contains(index));
+        node.is_cached = progress.ran.as_ref().map(|ran| !ran.contains(index));
     }
-    record.command = progress.command.to_vec();
+    record.command = progress.command.clone();
 }
 
 #[cfg(test)]

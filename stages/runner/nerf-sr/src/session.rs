@@ -65,24 +65,17 @@ impl Session {
     ) -> anyhow::Result<Plan> {
         let (pipeline, targets) = planning::find_targets(&self.pipeline, &request.targets)?;
         let request = Request { targets, ..request.clone() };
-        let request = stage_inputs::with_folders(&pipeline, self, &request, describing)?;
-        let plan = self.plan_of(&pipeline, &request, describing)?;
+        let plan_of = |request: &Request| {
+            let plan = Plan::new(&pipeline, &self.store, request, describing)?;
+            Ok(Plan { devices: self.devices.clone(), ..plan })
+        };
+        let plan =
+            plan_of(&stage_inputs::with_folders(&pipeline, &self.store, &request, plan_of)?)?;
         check_not_in_input(&plan, "the store", self.store.root())?;
         for note in &plan.notes {
             report_text(note);
         }
         Ok(plan)
-    }
-
-    /// Creates a plan of a pipeline, without checks and notes.
-    pub(crate) fn plan_of(
-        &self,
-        pipeline: &Pipeline,
-        request: &Request,
-        describing: Describing,
-    ) -> Result<Plan, PlanError> {
-        let plan = Plan::new(pipeline, &self.store, request, describing)?;
-        Ok(Plan { devices: self.devices.clone(), ..plan })
     }
 
     /// Finds the queued or running job of each node, and the number of this store's other jobs.

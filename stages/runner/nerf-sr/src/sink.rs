@@ -11,7 +11,7 @@ use artifact::{
 use planning::stage_call::{Call, Display, StageFailure};
 use planning::{Sink, environment_parts};
 use serde_json::{Map, Value, json};
-use store::{Record, StoreError};
+use store::StoreError;
 
 use crate::page::PageMark;
 use crate::publish::{has_current_page, publish};
@@ -35,9 +35,9 @@ pub(crate) fn sink_parts(sink: &Sink) -> Map<String, Value> {
     parts
 }
 
-/// True if a sink's page already shows these records.
-pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, records: &[Option<Record>]) -> bool {
-    let record = run_record(run, sink, &RunProgress { records, ..RunProgress::default() });
+/// True if a sink's page already shows the run's records.
+pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, progress: &RunProgress) -> bool {
+    let record = run_record(run, sink, progress);
     record.is_some_and(|(record, _)| {
         has_current_page(&run.out.join(&sink.stage), &page_identity(sink, &record))
     })
@@ -81,7 +81,7 @@ pub(crate) fn run_sink(
     run: &Run<'_>,
     sink: &Sink,
     threads: usize,
-    progress: &RunProgress<'_>,
+    progress: &RunProgress,
 ) -> anyhow::Result<bool> {
     let Some((mut record, indices)) = run_record(run, sink, progress) else {
         print_line!("{}: nothing to show", sink.stage);

@@ -43,34 +43,34 @@ impl Executor for Local {
         if let Some(text) = run_text(plan, run.estimates, self.budget.cores) {
             report_text(&format!("nerf-sr: {text}"));
         }
-        let outcome = run_nodes(run, self);
+        let (progress, skipped) = run_nodes(run, self);
         if run.stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
         }
-        if let Some((index, failure)) = outcome.failures.first() {
+        if let Some((index, failure)) = progress.failures.first() {
             // Without any result, pages are written only with --keep-going: a table then names the
             // failed stages.
-            if self.keep_going || outcome.records.iter().any(Option::is_some) {
+            if self.keep_going || progress.records.iter().any(Option::is_some) {
                 let partial = plan.sinks.iter().filter(|sink| sink.program.description.partial);
                 // A sink's failure doesn't replace the stage's exit code.
-                if let Err(error) = self.run_sinks(run, partial, &outcome) {
+                if let Err(error) = self.run_sinks(run, partial, &progress) {
                     report_line!("nerf-sr: {error:#}");
                 }
             }
             let node = &plan.nodes[*index];
             let log_command = self.log_command(&node.stage);
-            report_text(&failure_message(&node.label(), outcome.skipped, &log_command));
+            report_text(&failure_message(&node.label(), skipped, &log_command));
             return Ok(ExitCode::from(failure.code));
         }
-        print_summaries(run, &outcome);
-        let (has_written, first_failure) = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
+        print_summaries(run, &progress);
+        let (has_written, first_failure) = self.run_sinks(run, plan.sinks.iter(), &progress)?;
         if let Some(code) = first_failure {
             return Ok(ExitCode::from(code));
         }
-        let ran = outcome.ran.iter();
-        let ran = ran.filter_map(|&index| Some((index, outcome.records[index].as_ref()?)));
+        let ran = progress.ran.iter().flatten();
+        let end = end_message(ran.clone().count(), plan.nodes.len(), has_written);
+        let ran = ran.filter_map(|&index| Some((index, progress.records[index].as_ref()?)));
         let comparison = total_comparison_text(run.estimates, ran);
-        let end = end_message(outcome.ran.len(), plan.nodes.len(), has_written);
         print_line!("{end}{}", comparison.map_or_else(String::new, |text| format!("; {text}")));
         Ok(ExitCode::SUCCESS)
     }
@@ -91,17 +91,11 @@ impl Local {
         &self,
         run: &Run<'_>,
         sinks: impl Iterator<Item = &'a Sink>,
-        outcome: &Outcome,
+        progress: &RunProgress,
     ) -> anyhow::Result<(bool, Option<u8>)> {
-        let progress = RunProgress {
-            records: &outcome.records,
-            ran: Some(&outcome.ran),
-            failures: &outcome.failures,
-            command: &command_line(),
-        };
         let (mut any_written, mut first_failure) = (false, None);
         for sink in sinks {
-            let result = run_sink(run, sink, self.budget.cores, &progress);
+            let result = run_sink(run, sink, self.budget.cores, progress);
             if run.stop.load(Ordering::Relaxed) {
                 return Err(Failure::Interrupted.into());
             }
@@ -118,23 +112,12 @@ impl Local {
     }
 }
 
-/// Outcome of a run's nodes.
-#[derive(Default)]
-struct Outcome {
-    /// Records by node index; `None` if the node isn't done.
-    records: Vec<Option<Record>>,
-    /// Nodes that ran.
-    ran: BTreeSet<usize>,
-    /// Nodes that failed.
-    failures: Vec<(usize, StageFailure)>,
-    /// Number of nodes that were skipped because of the failures.
-    skipped: usize,
-}
-
 /// Report of a worker: the node, its record, and whether the stage ran.
 type WorkerReport = (usize, anyhow::Result<(Record, bool)>);
 
-fn run_nodes(run: &Run<'_>, options: &Local) -> Outcome {
+/// Runs the nodes. Returns their progress, and the number of nodes that were skipped because of
+/// failures.
+fn run_nodes(run: &Run<'_>, options: &Local) -> (RunProgress, usize) {
     let display = Display::new();
     let mut schedule = Schedule::new(run, options, &display);
     let (sender, reports) = mpsc::channel::<WorkerReport>();
@@ -154,7 +137,7 @@ fn run_nodes(run: &Run<'_>, options: &Local) -> Outcome {
         }
     });
     let skipped = schedule.pending.len() + schedule.ready.len();
-    Outcome { skipped, ..schedule.outcome }
+    (schedule.progress, skipped)
 }
 
 /// Progress of a run's nodes.
@@ -170,7 +153,7 @@ struct Schedule<'a> {
     running: BTreeMap<usize, Demand>,
     /// All records of the store, read when the first node isn't cached.
     records: OnceCell<Vec<Record>>,
-    outcome: Outcome,
+    progress: RunProgress,
 }
 
 /// A node that isn't cached and whose parents are done.
@@ -192,14 +175,19 @@ impl<'a> Schedule<'a> {
             ready: BTreeMap::new(),
             running: BTreeMap::new(),
             records: OnceCell::new(),
-            outcome: Outcome { records: vec![None; count], ..Outcome::default() },
+            progress: RunProgress {
+                records: vec![None; count],
+                ran: Some(BTreeSet::new()),
+                command: command_line(),
+                ..RunProgress::default()
+            },
         }
     }
 
     /// True if no further node may start.
     fn is_stopping(&self) -> bool {
         self.run.stop.load(Ordering::Relaxed)
-            || (!self.options.keep_going && !self.outcome.failures.is_empty())
+            || (!self.options.keep_going && !self.progress.failures.is_empty())
     }
 
     fn report(&self, index: usize, text: &str) {
@@ -210,7 +198,7 @@ impl<'a> Schedule<'a> {
         let node = &self.run.plan.nodes[index];
         let parents = node
             .parents()
-            .filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?)))
+            .filter_map(|parent| Some((parent, self.progress.records[parent].clone()?)))
             .collect();
         let threads = self.options.budget.cores;
         let (run, display) = (self.run, self.display);
@@ -225,7 +213,7 @@ impl<'a> Schedule<'a> {
         let watch = self.options.watch.as_ref().filter(|_| has_checkpoints)?;
         let chain = Chain::find(plan, index, &|origin| {
             input_folder(origin, self.run.store, &|index| {
-                self.outcome.records[index].as_ref().map(|record| record.output.clone())
+                self.progress.records[index].as_ref().map(|record| record.output.clone())
             })
         });
         if chain.is_none() {
@@ -241,13 +229,13 @@ impl<'a> Schedule<'a> {
         for index in self.pending.clone() {
             let node = &self.run.plan.nodes[index];
             if self.is_stopping()
-                || node.parents().any(|parent| self.outcome.records[parent].is_none())
+                || node.parents().any(|parent| self.progress.records[parent].is_none())
             {
                 continue;
             }
             self.pending.remove(&index);
             match self.job(index).look_up() {
-                Ok(Lookup::Cached(record)) => self.outcome.records[index] = Some(record),
+                Ok(Lookup::Cached(record)) => self.progress.records[index] = Some(record),
                 Ok(Lookup::Pending(action)) => {
                     let records = self.records.get_or_init(|| {
                         if let Some(line) = self.options.budget.limit_line() {
@@ -295,9 +283,9 @@ impl<'a> Schedule<'a> {
         self.running.remove(&index);
         match result {
             Ok((record, ran)) => {
-                self.outcome.records[index] = Some(record);
+                self.progress.records[index] = Some(record);
                 if ran {
-                    self.outcome.ran.insert(index);
+                    self.progress.ran.get_or_insert_default().insert(index);
                 }
             }
             Err(error) => self.fail(index, &error),
@@ -309,19 +297,19 @@ impl<'a> Schedule<'a> {
         // A stage that was interrupted has not failed.
         let failed = if failure.code == Failure::Interrupted.exit_code() { "" } else { "failed: " };
         self.report(index, &format!("{failed}{}", failure.message));
-        self.outcome.failures.push((index, failure));
+        self.progress.failures.push((index, failure));
     }
 }
 
 /// Prints the summary of each node that is no other node's parent.
-fn print_summaries(run: &Run<'_>, outcome: &Outcome) {
+fn print_summaries(run: &Run<'_>, progress: &RunProgress) {
     let plan = run.plan;
     let parents: BTreeSet<usize> = plan.nodes.iter().flat_map(Node::parents).collect();
     for (index, node) in plan.nodes.iter().enumerate() {
         if parents.contains(&index) {
             continue;
         }
-        let Some(record) = &outcome.records[index] else { continue };
+        let Some(record) = &progress.records[index] else { continue };
         let recorded = record.summary.clone();
         if let Some(summary) = recorded.or_else(|| read_summary(&run.store.object(&record.output)))
         {

@@ -11,10 +11,10 @@ use artifact::{Failure, format_count, hash_json, print_line, report_line};
 use planning::{FrozenPlan, PlanError, Sink, State};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, SubmitOptions, Submitted, Task};
-use store::Record;
 
 use super::Executor;
 use crate::run_messages;
+use crate::run_record::RunProgress;
 use crate::session::{Run, check_utf8_path, node_identities};
 use crate::sink::{is_up_to_date, sink_parts};
 use crate::waiting::lock_file;
@@ -130,8 +130,9 @@ fn sink_identity(sink: &Sink, node_identities: &[String], out: &Path) -> String 
 fn find_done(run: &Run<'_>, out: &Path) -> anyhow::Result<Vec<bool>> {
     let run = Run { out, ..*run };
     let states = run.plan.states(run.store, Some(run.stop))?;
-    let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
-    let mut done: Vec<bool> = records.iter().map(Option::is_some).collect();
-    done.extend(run.plan.sinks.iter().map(|sink| is_up_to_date(&run, sink, &records)));
+    let records = states.into_iter().map(State::into_record).collect();
+    let progress = RunProgress { records, ..RunProgress::default() };
+    let mut done: Vec<bool> = progress.records.iter().map(Option::is_some).collect();
+    done.extend(run.plan.sinks.iter().map(|sink| is_up_to_date(&run, sink, &progress)));
     Ok(done)
 }

@@ -56,7 +56,7 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
         // No estimates: those of the submitting machine may not be valid on this one.
         let estimates = &Estimates::default();
         let run = Run { plan, store, file: &file, out, estimates, stop: &stop };
-        let result = run_task(&run, &command);
+        let result = run_task(&run, command);
         file.end().ok();
         result
     });
@@ -99,14 +99,14 @@ fn requeue(plan: &Plan, store: &Store) -> anyhow::Result<()> {
 
 /// Runs the task of a plan for one job. `command` is the command line of the run that submitted the
 /// task.
-fn run_task(run: &Run<'_>, command: &[String]) -> anyhow::Result<()> {
+fn run_task(run: &Run<'_>, command: Vec<String>) -> anyhow::Result<()> {
     let states = run.plan.states(run.store, Some(run.stop))?;
     let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
     let threads = stage::processors().count;
     stage::start_threads(threads);
     if let Some(sink) = run.plan.sinks.first() {
         check_parents(run.plan, &sink.stage, sink.nodes().into_iter(), &records)?;
-        let progress = RunProgress { records: &records, command, ..RunProgress::default() };
+        let progress = RunProgress { records, command, ..RunProgress::default() };
         run_sink(run, sink, threads, &progress)?;
         return Ok(());
     }
