@@ -115,8 +115,8 @@ fn stage_part(record: Option<&Record>) -> Map<String, Value> {
     stage.map(|(name, value)| (name.clone(), value.clone())).into_iter().collect()
 }
 
-/// Adds metrics, the hashes of files, and values that the scene decided. JSON files contribute their
-/// metrics and resolved defaults instead of their hashes.
+/// Adds metrics, the hashes of files, and values that the scene decided. JSON files contribute
+/// their metrics and resolved defaults instead of their hashes.
 fn add_content(
     parts: &mut Map<String, Value>,
     record: &Record,

@@ -1,6 +1,6 @@
 //! Folders of published pages: their marks, whether a folder may be replaced, and where a page is
-//! moved that a new one replaces. A page is archived if it shows a result that the new page lacks. A
-//! result is a stage with parameter values and a data set.
+//! moved that a new one replaces. A page is archived if it shows a result that the new page lacks.
+//! A result is a stage with parameter values and a data set.
 
 use std::collections::BTreeSet;
 use std::ffi::OsStr;

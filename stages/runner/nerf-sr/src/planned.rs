@@ -85,8 +85,8 @@ impl Planned<'_> {
         (!entries.is_empty()).then(|| format!("by scene: {}", entries.join(", ")))
     }
 
-    /// Describes a sink's nodes and when a run writes the sink's page. The text doesn't depend on an
-    /// existing page, because only `run` knows the folder of pages.
+    /// Describes a sink's nodes and when a run writes the sink's page. The text doesn't depend on
+    /// an existing page, because only `run` knows the folder of pages.
     pub(crate) fn sink_text(&self, sink: &Sink) -> String {
         let nodes = sink.nodes();
         let mut names: Vec<&str> =

@@ -74,9 +74,9 @@ fn listing(folder: &Path) -> Vec<String> {
     lines.collect()
 }
 
-/// Calls a sink, publishes its page as `out/STAGE`, and prints its path and the new paths of earlier
-/// pages. Returns whether a page was written: not if a node that the sink shows has no record, or if
-/// the folder already shows this record.
+/// Calls a sink, publishes its page as `out/STAGE`, and prints its path and the new paths of
+/// earlier pages. Returns whether a page was written: not if a node that the sink shows has no
+/// record, or if the folder already shows this record.
 pub(crate) fn run_sink(
     run: &Run<'_>,
     sink: &Sink,

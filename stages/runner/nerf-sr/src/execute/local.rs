@@ -85,8 +85,8 @@ impl Local {
         command_text([program, "log", stage].into_iter().chain(arguments))
     }
 
-    /// Runs sinks, and prints the paths of their pages and their failures. Returns whether a page was
-    /// written, and the exit code of the first sink that failed.
+    /// Runs sinks, and prints the paths of their pages and their failures. Returns whether a page
+    /// was written, and the exit code of the first sink that failed.
     fn run_sinks<'a>(
         &self,
         run: &Run<'_>,

@@ -41,18 +41,8 @@ impl Collection {
     /// pin is damaged: artifacts that it needs are unknown then.
     pub(crate) fn new(store: &Store, plan: Root, policy: Policy) -> Result<Self, StoreError> {
         let contents = Contents::read(store)?;
-        let runs = store.runs()?;
-        // Submissions are read after the runs: if a run submits jobs and ends between the two
-        // reads, its jobs are found.
-        let submissions = roots::outstanding_submissions(store)?;
-        let roots = roots::find_roots(store, &contents, plan, policy, &runs, &submissions)?;
+        let (roots, old_runs) = roots::find_roots(store, &contents, plan, policy)?;
         let kept = contents.reach(&roots);
-        let is_old = |run: &&store::Run| {
-            !run.in_progress
-                && !submissions.contains_key(&run.id)
-                && !policy.is_recent(run.last_used_unix())
-        };
-        let old_runs = runs.iter().filter(is_old).map(|run| run.id.clone()).collect();
         Ok(Self { contents, kept, old_runs })
     }
 

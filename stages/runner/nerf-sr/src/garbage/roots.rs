@@ -43,28 +43,36 @@ impl Policy {
     }
 }
 
-/// Returns all roots of a store. If several roots reach an entry, the first one gives the reason.
+/// Returns all roots of a store, and the IDs of runs that are none. If several roots reach an entry,
+/// the first one gives the reason.
 pub(crate) fn find_roots(
     store: &Store,
     contents: &Contents,
     plan: Root,
     policy: Policy,
-    runs: &[Run],
-    submissions: &BTreeMap<String, String>,
-) -> Result<Vec<Root>, StoreError> {
-    let mut roots = vec![plan];
+) -> Result<(Vec<Root>, Vec<String>), StoreError> {
+    let (mut roots, mut old_runs) = (vec![plan], Vec::new());
     for pin in store.pins()? {
         roots.push(run_root(format!("pinned as {}", pin.id), pin));
     }
-    for run in runs.iter().cloned() {
-        if let Some(reason) = submissions.get(&run.id) {
-            roots.push(run_root(reason.clone(), run));
+    let runs = store.runs()?;
+    // Submissions are read after the runs: if a run submits jobs and ends between the two reads,
+    // its jobs are found.
+    let submissions = outstanding_submissions(store)?;
+    for run in runs {
+        let used_unix = run.last_used_unix();
+        let reason = if let Some(reason) = submissions.get(&run.id) {
+            reason.clone()
         } else if run.in_progress {
             let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
-            roots.push(run_root(format!("needed by the run of process {process}"), run));
-        } else if policy.is_recent(run.last_used_unix()) {
-            roots.push(run_root(format!("used by a run {}", age_text(run.last_used_unix())), run));
-        }
+            format!("needed by the run of process {process}")
+        } else if policy.is_recent(used_unix) {
+            format!("used by a run {}", age_text(used_unix))
+        } else {
+            old_runs.push(run.id);
+            continue;
+        };
+        roots.push(run_root(reason, run));
     }
     for key in store.locked_keys()? {
         roots.push(action_root("a stage is creating it".to_owned(), &key));
@@ -87,14 +95,12 @@ pub(crate) fn find_roots(
             }
         }
     }
-    Ok(roots)
+    Ok((roots, old_runs))
 }
 
 /// Returns the ids of submissions with unfinished jobs, each with the reason for keeping it; all
 /// submissions if Slurm doesn't answer.
-pub(crate) fn outstanding_submissions(
-    store: &Store,
-) -> Result<BTreeMap<String, String>, StoreError> {
+fn outstanding_submissions(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
     let (reason, ids) = match Queue::read(&Slurm::default(), store.root()) {
         Ok(queue) => (
             "a submitted job needs it".to_owned(),

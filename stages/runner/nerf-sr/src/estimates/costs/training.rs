@@ -9,9 +9,9 @@ use super::number;
 use crate::estimates::work::{SceneKind, Work};
 
 /// Seconds per training ray late in a training, without those per step; samples of such a ray; and
-/// seconds per step of any size. Measured on lego 100×2, fern 252×2 and the demo scene with backdrop
-/// (docs/results/engine.md), steps with 6,144 to 24,576 `samples_per_step`. More cells of a frustum
-/// are occupied, and its tables are larger.
+/// seconds per step of any size. Measured on lego 100×2, fern 252×2 and the demo scene with
+/// backdrop (docs/results/engine.md), steps with 6,144 to 24,576 `samples_per_step`. More cells of
+/// a frustum are occupied, and its tables are larger.
 const OBJECT: (f64, f64, f64) = (10.8e-6, 22.0, 3.3e-3);
 const FRUSTUM: (f64, f64, f64) = (22e-6, 36.0, 8.3e-3);
 const UNBOUNDED: (f64, f64, f64) = (20e-6, 36.0, 3.3e-3);
