@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use artifact::format_count;
-use dataset::{Dataset, Format, Frame, Split};
+use dataset::{Dataset, Format, Split};
 use pixels::{DEGRADATION_FILE, Filter, Kernel};
-use scene::VIEWS_FILE;
+use scene::{Background, Intrinsics, Space, VIEWS_FILE, Views};
 use serde_json::Value;
 use workload::preparation_bytes;
 
@@ -57,15 +57,14 @@ impl SceneImages {
             let Ok(bytes) = std::fs::read(artifact.join(folder).join(VIEWS_FILE)) else {
                 continue;
             };
-            let views: Value = serde_json::from_slice(&bytes).ok()?;
-            let (space, list) = (&views["bounds"]["space"], views["views"].as_array()?);
-            scene.kind = kind_of(views["background"] == "opaque", space.get("ndc").is_some());
-            scene.widths_across = widths_across(space, list).unwrap_or(1.0);
-            let sizes = list.iter().map(|view| {
-                let size = &view["camera"]["intrinsics"];
-                Some((size["width"].as_f64()?, size["height"].as_f64()?))
-            });
-            scene.folders.push((folder, images_of(&sizes.collect::<Option<Vec<_>>>()?)));
+            let Views { background, bounds, views, .. } = serde_json::from_slice(&bytes).ok()?;
+            let is_ndc = matches!(bounds.space, Space::Ndc(_));
+            scene.kind = kind_of(background == Background::Opaque, is_ndc);
+            let sizes: Vec<Intrinsics> = views.iter().map(|view| view.camera.intrinsics).collect();
+            scene.widths_across =
+                sizes.first().map_or(1.0, |size| widths_across(&bounds.space, size));
+            let sizes: Vec<(f64, f64)> = sizes.into_iter().map(size_of).collect();
+            scene.folders.push((folder, images_of(&sizes)));
         }
         if let Ok(bytes) = std::fs::read(artifact.join("train").join(DEGRADATION_FILE)) {
             let degradation: Value = serde_json::from_slice(&bytes).ok()?;
@@ -91,10 +90,9 @@ impl SceneImages {
         let is_opaque = background.map_or(!is_object, |background| background == "opaque");
         let space = parameters["space"].as_str();
         let is_ndc = space.map_or(set.format == Format::Llff, |space| space == "ndc");
-        let sizes = set.frames.iter().map(Frame::intrinsics);
         let planned = PlannedScene {
             kind: kind_of(is_opaque, is_ndc),
-            sizes: sizes.map(|size| (f64::from(size.width), f64::from(size.height))).collect(),
+            sizes: set.frames.iter().map(|frame| size_of(frame.intrinsics())).collect(),
             split,
             is_benchmark: set.format.is_benchmark(),
         };
@@ -214,15 +212,15 @@ fn kind_of(is_opaque: bool, is_ndc: bool) -> SceneKind {
 }
 
 /// Returns the width of the field's cube, in widths of a view, as in `train-ss`.
-fn widths_across(space: &Value, views: &[Value]) -> Option<f64> {
-    if space == "contraction" {
-        return Some(CONTRACTION_WIDTHS);
+fn widths_across(space: &Space, view: &Intrinsics) -> f64 {
+    match space {
+        Space::Box => 1.0,
+        Space::Contraction => CONTRACTION_WIDTHS,
+        Space::Ndc(frustum) => {
+            let side = |axis: usize| frustum.max[axis] - frustum.min[axis];
+            side(0).max(side(1)) * (view.fx / f64::from(view.width))
+        }
     }
-    let frustum = space.get("ndc")?;
-    let side = |axis: usize| Some(frustum["max"][axis].as_f64()? - frustum["min"][axis].as_f64()?);
-    let intrinsics = &views.first()?["camera"]["intrinsics"];
-    let focal_lengths = intrinsics["fx"].as_f64()? / intrinsics["width"].as_f64()?;
-    Some(side(0)?.max(side(1)?) * focal_lengths)
 }
 
 fn planned_widths_across(kind: SceneKind, space: &Value) -> f64 {
@@ -239,6 +237,10 @@ fn is_mean_kernel(kernel: &Value, by_default: bool) -> bool {
     kernel.map_or(by_default, |kernel| kernel.filter() == Filter::Box)
 }
 
+fn size_of(image: Intrinsics) -> (f64, f64) {
+    (f64::from(image.width), f64::from(image.height))
+}
+
 /// Returns number and size of images with the given widths and heights.
 fn images_of(sizes: &[(f64, f64)]) -> Images {
     let sizes = sizes.iter().map(|(width, height)| (width.round() as u64, height.round() as u64));
@@ -251,6 +253,7 @@ fn images_of(sizes: &[(f64, f64)]) -> Images {
 
 #[cfg(test)]
 mod tests {
+    use scene::{Bounds, Camera, Frustum, View};
     use serde_json::json;
 
     use super::*;
@@ -316,19 +319,25 @@ mod tests {
         assert!(SceneImages::of_artifact(folder.path()).unwrap().images("train").is_none());
         let train = folder.path().join("train");
         std::fs::create_dir(&train).unwrap();
-        let view = json!({"camera": {"intrinsics": {"width": 30, "height": 20, "fx": 45.0}}});
-        let scene_in = |space: Value| {
-            let views = json!({
-                "background": "opaque", "bounds": {"space": space}, "views": [view, view],
-            });
-            std::fs::write(train.join(VIEWS_FILE), views.to_string()).unwrap();
+        let intrinsics = Intrinsics { fx: 45.0, ..Intrinsics::from_angle_x(30, 20, 0.7) };
+        let camera_to_world = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
+        let view = |name: &str| {
+            let name = name.to_owned();
+            View::camera_only(Camera { name, intrinsics, camera_to_world })
+        };
+        let scene_in = |space: Space| {
+            let bounds = Bounds { space, ..Bounds::cube(1.0, 2.0, 6.0) };
+            let views = Views::new(Background::Opaque, bounds, vec![view("a"), view("b")]);
+            artifact::write_json(&train.join(VIEWS_FILE), &views).unwrap();
             SceneImages::of_artifact(folder.path()).unwrap()
         };
-        let scene = scene_in(json!("contraction"));
+        let scene = scene_in(Space::Contraction);
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Unbounded, 2.0));
         let images = Images { count: 2, pixels: 1200, largest_size: (30, 20) };
         assert_eq!(scene.images("train"), Some(images));
-        let scene = scene_in(json!({"ndc": {"min": [-0.5, -0.25], "max": [0.5, 0.25]}}));
+        let frustum =
+            Frustum { camera_to_world, min: [-0.5, -0.25], max: [0.5, 0.25], near: 1.0, far: 2.0 };
+        let scene = scene_in(Space::Ndc(frustum));
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Frustum, 1.5));
         std::fs::write(train.join(VIEWS_FILE), "{").unwrap();
         assert!(SceneImages::of_artifact(folder.path()).is_none());
