@@ -61,11 +61,10 @@ pub(crate) fn check_ownership(target: &Path, kind: &str) -> anyhow::Result<()> {
     if is_link || !target.is_dir() {
         bail!("{} is not a folder written by nerf-sr", target.display());
     }
-    let mut entries = fs::read_dir(target).map_err(|e| unreadable(target, &e))?;
-    if entries.next().is_none() {
+    let files = list_files(target)?;
+    if files.is_empty() {
         return Ok(());
     }
-    let files = list_files(target)?;
     // The mark decides whether the page is archived, so it must be readable.
     PageMark::read(target).map_err(|e| unreadable(&target.join(MARK_FILE), &e))?;
     let manifest = Manifest::read(target).ok();

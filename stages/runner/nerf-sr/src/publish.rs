@@ -51,7 +51,10 @@ pub(crate) fn publish(
     let _lock = lock_file(out, File::options().read(true), stop)?;
     let mark = PageMark::read(output).with_context(|| output.display().to_string())?;
     let publishing = Publishing { target, kind, mark: mark.unwrap_or_default() };
-    let result = publishing.run(output);
+    let result = publishing.finish_earlier().and_then(|mut archived| {
+        archived.extend(publishing.replace(output)?);
+        Ok(archived)
+    });
     remove_folder(&publishing.hidden("scrap")).ok();
     // Other errors name their files.
     result.map_err(|error| {
@@ -70,13 +73,6 @@ struct Publishing<'a> {
 impl Publishing<'_> {
     fn hidden(&self, suffix: &str) -> PathBuf {
         hidden(self.target, suffix)
-    }
-
-    /// Publishes the output. Returns the new paths of earlier pages that were archived.
-    fn run(&self, output: &Path) -> anyhow::Result<Vec<PathBuf>> {
-        let mut archived = self.finish_earlier()?;
-        archived.extend(self.replace(output)?);
-        Ok(archived)
     }
 
     /// Finishes a killed publishing. Returns the new paths of its pages that were archived.

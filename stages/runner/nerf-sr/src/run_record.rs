@@ -53,9 +53,10 @@ pub(crate) fn run_record(
         let record = progress.records[index].as_ref()?;
         nodes.push(run_node(&plan.nodes[index], record, &done, shown, run.store));
     }
+    let numbers = [&done[..], &undone].concat();
     let unfinished = undone
         .iter()
-        .map(|&index| unfinished_node(plan, index, &done, &undone, progress))
+        .map(|&index| unfinished_node(&plan.nodes[index], index, &numbers, progress))
         .collect();
     let mut failed = Vec::with_capacity(missing.len());
     for ShownPoint { node, point, values } in missing {
@@ -142,16 +143,14 @@ fn run_node(
     }
 }
 
+/// Returns the record of an unfinished node. `numbers` are the indices of all nodes in a record:
+/// done ones first.
 fn unfinished_node(
-    plan: &Plan,
+    node: &Node,
     index: usize,
-    done: &[usize],
-    undone: &[usize],
+    numbers: &[usize],
     progress: &RunProgress,
 ) -> UnfinishedNode {
-    let node = &plan.nodes[index];
-    // Numbers of a record's nodes: done ones first.
-    let numbers: Vec<usize> = done.iter().chain(undone).copied().collect();
     let failure = progress.failures.iter().find(|(failed, _)| *failed == index);
     UnfinishedNode {
         stage: node.stage.clone(),

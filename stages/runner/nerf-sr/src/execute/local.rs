@@ -119,7 +119,22 @@ type WorkerReport = (usize, anyhow::Result<(Record, bool)>);
 /// failures.
 fn run_nodes(run: &Run<'_>, options: &Local) -> (RunProgress, usize) {
     let display = Display::new();
-    let mut schedule = Schedule::new(run, options, &display);
+    let count = run.plan.nodes.len();
+    let mut schedule = Schedule {
+        run,
+        options,
+        display: &display,
+        pending: (0..count).collect(),
+        ready: BTreeMap::new(),
+        running: BTreeMap::new(),
+        records: OnceCell::new(),
+        progress: RunProgress {
+            records: vec![None; count],
+            ran: Some(BTreeSet::new()),
+            command: command_line(),
+            ..RunProgress::default()
+        },
+    };
     let (sender, reports) = mpsc::channel::<WorkerReport>();
     std::thread::scope(|scope| {
         loop {
@@ -165,25 +180,6 @@ struct ReadyNode {
 }
 
 impl<'a> Schedule<'a> {
-    fn new(run: &'a Run<'a>, options: &'a Local, display: &'a Display) -> Self {
-        let count = run.plan.nodes.len();
-        Self {
-            run,
-            options,
-            display,
-            pending: (0..count).collect(),
-            ready: BTreeMap::new(),
-            running: BTreeMap::new(),
-            records: OnceCell::new(),
-            progress: RunProgress {
-                records: vec![None; count],
-                ran: Some(BTreeSet::new()),
-                command: command_line(),
-                ..RunProgress::default()
-            },
-        }
-    }
-
     /// True if no further node may start.
     fn is_stopping(&self) -> bool {
         self.run.stop.load(Ordering::Relaxed)

@@ -16,7 +16,7 @@ pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::
     let nodes = nodes_of_stage(&plan, stage);
     let logs = nodes.as_ref().map_or(Ok(Vec::new()), |nodes| find_logs(session, &plan, nodes))?;
     for log in &logs {
-        log.print()?;
+        print(log)?;
     }
     if !logs.is_empty() {
         return Ok(());
@@ -31,23 +31,17 @@ pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::
         "{stage}: no log for these arguments; this is the log of its last run, {}",
         format_utc(unix)
     );
-    log.print()?;
+    print(&log)
+}
+
+/// Label and path of the log of one node.
+type NodeLog = (String, PathBuf);
+
+fn print((label, path): &NodeLog) -> anyhow::Result<()> {
+    let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
+    print_line!("{label} ({}):", path.display());
+    print_lines(&String::from_utf8_lossy(&bytes));
     Ok(())
-}
-
-/// Log of one node.
-struct NodeLog {
-    label: String,
-    path: PathBuf,
-}
-
-impl NodeLog {
-    fn print(&self) -> anyhow::Result<()> {
-        let bytes = std::fs::read(&self.path).with_context(|| self.path.display().to_string())?;
-        print_line!("{} ({}):", self.label, self.path.display());
-        print_lines(&String::from_utf8_lossy(&bytes));
-        Ok(())
-    }
 }
 
 /// Finds the existing logs of nodes: for each node, the stage's log and that of the newest job.
@@ -67,7 +61,7 @@ fn find_logs(session: &Session, plan: &Plan, nodes: &[usize]) -> anyhow::Result<
         });
         let job_log = job_logs.get(node).cloned().flatten();
         for path in [stage_log, job_log].into_iter().flatten().filter(|path| path.is_file()) {
-            logs.push(NodeLog { label: plan.nodes[node].label(), path });
+            logs.push((plan.nodes[node].label(), path));
         }
     }
     Ok(logs)
@@ -105,7 +99,7 @@ fn find_last_log(store: &Store, stage: &str) -> Result<Option<(u64, NodeLog)>, S
     let logs = actions.into_iter().filter_map(|(path, stage, point)| {
         let time = path.metadata().ok().filter(Metadata::is_file)?.modified().ok()?;
         let unix = time.duration_since(UNIX_EPOCH).ok()?.as_secs();
-        Some((unix, NodeLog { label: label(&stage, &point), path }))
+        Some((unix, (label(&stage, &point), path)))
     });
     Ok(logs.max_by_key(|(unix, _)| *unix))
 }
