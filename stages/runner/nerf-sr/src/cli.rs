@@ -353,7 +353,7 @@ fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Resu
         let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
         let budget = Budget::new(jobs, threads, memory.map(Memory::bytes));
         let executor = Local { budget, keep_going, plan_arguments, watch };
-        return verbs::run::run(&session, &request, &out, &executor);
+        return verbs::run::run(&session, &request, &out, |run| executor.carry_out(run));
     }
     if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
         bail_usage!(
@@ -367,7 +367,7 @@ fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Resu
         );
     }
     let site = Site::find(site.as_deref()).map_err(|e| Failure::Usage(e.to_string()))?;
-    verbs::run::run(&session, &request, &out, &Cluster { site })
+    verbs::run::run(&session, &request, &out, |run| Cluster { site }.carry_out(run))
 }
 
 impl GlobalArgs {

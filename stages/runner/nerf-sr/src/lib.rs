@@ -11,8 +11,8 @@
 //!   `waiting` waits for locks; `run_messages` has the messages at the end of a run.
 //! * `garbage`: deletes the artifacts that nothing needs.
 //! * `estimates`: processor time of the stages to run.
-//! * `planned`: a plan's nodes with their states, as text; `node_report`: as JSON. `lineage`
-//!   compares two results and their inputs.
+//! * `planned`: a plan's nodes with their states, as text and as JSON. `lineage` compares two
+//!   results and their inputs.
 //! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: gives the run's record (`run_record`) to stages that show it, such as the report, and
 //!   publishes their pages (`publish`, `page`).
@@ -24,7 +24,6 @@ mod estimates;
 mod execute;
 mod garbage;
 mod lineage;
-mod node_report;
 mod page;
 mod planned;
 mod publish;

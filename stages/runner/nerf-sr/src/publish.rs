@@ -210,7 +210,8 @@ fn copy_folder(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-fn exists(path: &Path) -> io::Result<bool> {
+/// Returns whether a file, folder or link exists.
+pub(crate) fn exists(path: &Path) -> io::Result<bool> {
     match path.symlink_metadata() {
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
         found => found.map(|_| true),

@@ -171,7 +171,7 @@ impl<'a> Estimator<'a> {
         let scene = self.scenes.get(&index)?;
         let training = match program {
             "train-ss" => Some(node),
-            _ => self.field(node),
+            _ => parent(node, "field").map(|(index, _)| &self.plan.nodes[index]),
         };
         let lr_images = training.and_then(|training| self.images(training)).map(|(_, lr)| lr);
         let lr_width = lr_images.unwrap_or_default().largest_size.0;
@@ -224,12 +224,6 @@ impl<'a> Estimator<'a> {
             Some(Origin::Node { .. }) => None,
         };
         Some((index, frames?))
-    }
-
-    /// Returns the node that trains the field which a node renders.
-    fn field(&self, node: &Node) -> Option<&'a Node> {
-        let (index, _) = parent(node, "field")?;
-        Some(&self.plan.nodes[index])
     }
 }
 

@@ -12,7 +12,6 @@ use planning::{Node, Sink};
 use stage::available_memory;
 use store::Record;
 
-use super::Executor;
 use super::budget::{Admission, Budget, Demand};
 use super::node::{Lookup, NodeJob, PendingAction, input_folder};
 use crate::estimates::{check_memory, run_text, total_comparison_text};
@@ -35,8 +34,9 @@ pub(crate) struct Local {
     pub(crate) watch: Option<Watch>,
 }
 
-impl Executor for Local {
-    fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
+impl Local {
+    /// Runs missing nodes, then the sinks. Returns the run's exit code.
+    pub(crate) fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
         let plan = run.plan;
         let free = available_memory()?.into_iter().chain([self.budget.memory]).min();
         check_memory(plan, run.estimates, free)?;
@@ -74,9 +74,7 @@ impl Executor for Local {
         print_line!("{end}{}", comparison.map_or_else(String::new, |text| format!("; {text}")));
         Ok(ExitCode::SUCCESS)
     }
-}
 
-impl Local {
     /// Returns the command that prints a stage's log.
     fn log_command(&self, stage: &str) -> String {
         let command = command_line();

@@ -12,7 +12,6 @@ use planning::{FrozenPlan, PlanError, Sink, State};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, SubmitOptions, Submitted, Task};
 
-use super::Executor;
 use crate::run_messages;
 use crate::run_record::RunProgress;
 use crate::session::{Run, check_utf8_path, node_identities};
@@ -27,8 +26,9 @@ pub(crate) struct Cluster {
     pub(crate) site: Site,
 }
 
-impl Executor for Cluster {
-    fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
+impl Cluster {
+    /// Submits jobs for missing nodes and sinks. Returns the run's exit code.
+    pub(crate) fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
         let root = run.store.root();
         let out = std::path::absolute(run.out)?;
         check_utf8_path("the folder of pages", &out)?;
@@ -56,9 +56,7 @@ impl Executor for Cluster {
         let submitted = submission.submit(root, &options, || find_done(run, &out))?;
         self.report(run, &submission, &submitted)
     }
-}
 
-impl Cluster {
     /// Prints what was submitted and returns the exit code.
     fn report(
         &self,
@@ -119,10 +117,8 @@ fn sink_identity(sink: &Sink, node_identities: &[String], out: &Path) -> String 
     let shows: Vec<&String> =
         sink.nodes().into_iter().map(|index| &node_identities[index]).collect();
     let mut parts = sink_parts(sink);
-    for (name, value) in [("sink", json!(sink.stage)), ("shows", json!(shows)), ("out", json!(out))]
-    {
-        parts.insert(name.to_owned(), value);
-    }
+    let own = [("sink", json!(sink.stage)), ("shows", json!(shows)), ("out", json!(out))];
+    parts.extend(own.map(|(name, value)| (name.to_owned(), value)));
     hash_json(&parts)
 }
 

@@ -131,12 +131,12 @@ fn check_parents(
     mut parents: impl Iterator<Item = usize>,
     records: &[Option<Record>],
 ) -> anyhow::Result<()> {
-    let Some(parent) = parents.find(|&parent| records[parent].is_none()) else {
-        return Ok(());
-    };
-    let parent = plan.nodes[parent].label();
-    bail_bad_input!(
-        "{label} needs {parent}, which has no artifact: its job failed, was cancelled, or is \
-        unknown to Slurm; run again"
-    );
+    if let Some(parent) = parents.find(|&parent| records[parent].is_none()) {
+        bail_bad_input!(
+            "{label} needs {}, which has no artifact: its job failed, was cancelled, or is unknown \
+            to Slurm; run again",
+            plan.nodes[parent].label()
+        );
+    }
+    Ok(())
 }

@@ -8,17 +8,16 @@ use planning::{Describing, Plan, Request, State, stored_inputs};
 use store::{RunFile, Store};
 
 use crate::estimates::Estimates;
-use crate::execute::Executor;
 use crate::planned::Planned;
 use crate::session::{Run, Session, check_not_in_input, command_line};
 use crate::waiting::enter_store;
 
-/// Runs the stages that the targets need, then the sinks.
+/// Runs the stages that the targets need, then the sinks, by `carry_out`.
 pub(crate) fn run(
     session: &Session,
     request: &Request,
     out: &Path,
-    executor: &dyn Executor,
+    carry_out: impl FnOnce(&Run<'_>) -> anyhow::Result<ExitCode>,
 ) -> anyhow::Result<ExitCode> {
     let stop = stop_on_signals()?;
     let plan = session.new_plan(request, Describing::OwnAndNeeded(&stop))?;
@@ -29,7 +28,7 @@ pub(crate) fn run(
     let planned = Planned { store, plan, states };
     let estimates = &Estimates::new(&planned);
     let run = Run { plan: &planned.plan, store, file: &file, out, estimates, stop: &stop };
-    let result = executor.carry_out(&run);
+    let result = carry_out(&run);
     // If the end can't be recorded, as on a full disk, the run's age is counted from its start.
     file.end().ok();
     result

@@ -5,8 +5,7 @@ use planning::{Request, short_hash};
 
 use super::print_json;
 use crate::estimates::Estimates;
-use crate::node_report::{ArtifactReport, PlanReport};
-use crate::planned::age_text;
+use crate::planned::{ArtifactReport, PlanReport, age_text};
 use crate::session::{Session, nodes_of_stage};
 
 /// Prints what `run` would do.

@@ -1,6 +1,4 @@
 use std::fmt::Display;
-use std::io;
-use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
@@ -8,6 +6,7 @@ use artifact::{Damage, format_count, print_line};
 use indicatif::{ProgressBar, ProgressStyle};
 use store::{Entered, Store, StoreError};
 
+use crate::publish::exists;
 use crate::waiting::enter_store;
 
 /// Reads all artifacts and records, and compares their contents with their hashes.
@@ -59,7 +58,7 @@ impl Verification<'_> {
         let _entered;
         if result.is_err() {
             _entered = self.enter()?;
-            if is_deleted(&self.store.object(identity)) {
+            if matches!(exists(&self.store.object(identity)), Ok(false)) {
                 return Ok(());
             }
             result = self.store.verify(identity);
@@ -134,10 +133,6 @@ impl Tally {
 }
 
 const REMOVED_NOTE: &str = "  removed; the next run creates it again";
-
-fn is_deleted(path: &Path) -> bool {
-    path.symlink_metadata().is_err_and(|error| error.kind() == io::ErrorKind::NotFound)
-}
 
 /// Creates a progress bar, which is visible only on a terminal.
 fn new_progress_bar(bytes: u64) -> ProgressBar {
