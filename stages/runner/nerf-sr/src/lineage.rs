@@ -105,7 +105,15 @@ impl Lineage {
     /// True if an input's hash is the artifact, or a folder of it, of a parent in this lineage.
     fn is_from_parent(&self, record: &Record, hash: &Value, store: &Store) -> bool {
         let mut parents = self.records.values().filter(|r| record.made_of.contains(&r.key()));
-        parents.any(|parent| is_hash_of(hash, &parent.output, store))
+        parents.any(|parent| {
+            let Ok(manifest) = store.manifest(&parent.output) else {
+                return *hash == parent.output;
+            };
+            let paths = manifest.files.iter().filter_map(|file| file.path.split_once('/'));
+            let folders: BTreeSet<&str> = paths.map(|(folder, _)| folder).collect();
+            *hash == parent.output
+                || folders.iter().any(|folder| *hash == manifest.subtree(folder).identity())
+        })
     }
 }
 
@@ -159,15 +167,4 @@ fn add_numbers(parts: &mut Map<String, Value>, name: &str, value: &Value) {
         }
         _ => {}
     }
-}
-
-/// True if a hash is that of an artifact or of one of its folders.
-fn is_hash_of(hash: &Value, output: &str, store: &Store) -> bool {
-    if hash == output {
-        return true;
-    }
-    let Ok(manifest) = store.manifest(output) else { return false };
-    let folders: BTreeSet<&str> =
-        manifest.files.iter().filter_map(|file| Some(file.path.split_once('/')?.0)).collect();
-    folders.into_iter().any(|folder| *hash == manifest.subtree(folder).identity())
 }

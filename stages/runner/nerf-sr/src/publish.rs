@@ -55,7 +55,7 @@ pub(crate) fn publish(
         archived.extend(publishing.replace(output)?);
         Ok(archived)
     });
-    remove_folder(&publishing.hidden("scrap")).ok();
+    remove_folder(&hidden(target, "scrap")).ok();
     // Other errors name their files.
     result.map_err(|error| {
         if error.is::<io::Error>() { error.context(target.display().to_string()) } else { error }
@@ -71,13 +71,9 @@ struct Publishing<'a> {
 }
 
 impl Publishing<'_> {
-    fn hidden(&self, suffix: &str) -> PathBuf {
-        hidden(self.target, suffix)
-    }
-
     /// Finishes a killed publishing. Returns the new paths of its pages that were archived.
     fn finish_earlier(&self) -> anyhow::Result<Vec<PathBuf>> {
-        let (old, new) = (self.hidden("old"), self.hidden("new"));
+        let (old, new) = (hidden(self.target, "old"), hidden(self.target, "new"));
         if !exists(self.target)? && exists(&old)? {
             fs::rename(&old, self.target)?;
         }
@@ -106,7 +102,7 @@ impl Publishing<'_> {
     /// Replaces the target's page by a copy of `output`. Returns the new path of the old page if
     /// that was archived.
     fn replace(&self, output: &Path) -> anyhow::Result<Option<PathBuf>> {
-        let (scrap, staged) = (self.hidden("scrap"), self.hidden("new"));
+        let (scrap, staged) = (hidden(self.target, "scrap"), hidden(self.target, "new"));
         remove_folder(&scrap)?;
         copy_folder(output, &scrap)?;
         fs::rename(&scrap, &staged)?;
@@ -131,7 +127,7 @@ impl Publishing<'_> {
         }
         // Not every file system can exchange two folders. Without that, the target doesn't exist
         // for a moment.
-        let old = self.hidden("old");
+        let old = hidden(self.target, "old");
         self.move_page(self.target, &old)?;
         let moved = fs::rename(page, self.target);
         let destination = if moved.is_ok() { page } else { self.target };
@@ -159,7 +155,7 @@ impl Publishing<'_> {
     fn move_page(&self, page: &Path, new: &Path) -> io::Result<()> {
         match fs::rename(page, new) {
             Err(e) if e.kind() == io::ErrorKind::CrossesDevices => {
-                let scrap = self.hidden("scrap");
+                let scrap = hidden(self.target, "scrap");
                 remove_folder(&scrap)?;
                 copy_folder(page, &scrap)?;
                 fs::rename(&scrap, new)?;
@@ -172,7 +168,7 @@ impl Publishing<'_> {
     /// Deletes a folder that a sink wrote. The folder is renamed first, so that a kill leaves no
     /// partial page under a page's name.
     fn delete(&self, folder: &Path) -> io::Result<()> {
-        let scrap = self.hidden("scrap");
+        let scrap = hidden(self.target, "scrap");
         remove_folder(&scrap)?;
         match fs::rename(folder, &scrap) {
             Err(e) if e.kind() == io::ErrorKind::CrossesDevices => remove_folder(folder),

@@ -2,6 +2,10 @@
 
 mod training;
 
+use std::sync::OnceLock;
+use std::time::Instant;
+
+use numerics::SpeedTest;
 use serde_json::Value;
 use store::ModelCost;
 use workload::{ExportViews, program_bytes};
@@ -50,6 +54,12 @@ const BACKDROP_RAY_SECONDS: f64 = 0.32e-6;
 const DEMO_BYTES: u64 = 5_000_000;
 const DEMO_PIXEL_BYTES: u64 = 16;
 const CAMERA_PATH_BYTES: u64 = 5_000_000;
+
+/// Seconds of a piece of work on the reference machine: two cores with AVX-512.
+const REFERENCE_SECONDS: f64 = 0.42e-3;
+/// Number of measurements, of which the fastest counts: others may have been interrupted by other
+/// programs. All together take a hundredth of a second. Chosen by hand.
+const MEASUREMENTS: u32 = 24;
 
 /// Returns the cost of a stage on the machine of these figures; `None` for stages without a model.
 pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Option<ModelCost> {
@@ -172,6 +182,27 @@ fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let field = work.field.as_ref()?;
     let seconds = number(field, "ensemble")? * pixels as f64 * ray;
     Some((seconds, rendering_memory(work)? + bytes))
+}
+
+/// Returns this machine's time for the work of [`SpeedTest`] over the reference machine's time. The
+/// first call measures the machine.
+pub(crate) fn slowness() -> f64 {
+    static SLOWNESS: OnceLock<f64> = OnceLock::new();
+    *SLOWNESS.get_or_init(measure)
+}
+
+fn measure() -> f64 {
+    let mut test = SpeedTest::default();
+    let mut fastest = f64::INFINITY;
+    let mut sum = 0.0;
+    for _ in 0..MEASUREMENTS {
+        let start = Instant::now();
+        sum += test.work();
+        fastest = fastest.min(start.elapsed().as_secs_f64());
+    }
+    // The compiler must not leave the work out.
+    std::hint::black_box(sum);
+    fastest / REFERENCE_SECONDS
 }
 
 #[cfg(test)]
@@ -344,5 +375,15 @@ mod tests {
             assert_eq!(model_cost(program, &json!({}), &work), None, "no parameters");
         }
         assert_eq!(min_memory("train-ss", &json!({}), &work), None, "no parameters");
+    }
+
+    /// Machines of the last twenty years are within a factor of fifty of the reference machine,
+    /// even while other tests run.
+    #[test]
+    fn slowness_of_this_machine_is_plausible() {
+        let start = Instant::now();
+        let slowness = measure();
+        println!("{slowness:.2} in {:.3} s", start.elapsed().as_secs_f64());
+        assert!((0.02..50.0).contains(&slowness), "{slowness}");
     }
 }

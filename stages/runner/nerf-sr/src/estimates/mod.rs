@@ -1,17 +1,14 @@
 //! Estimates of the processor time and peak memory of stages (docs/design/048).
 //!
-//! * `costs`: models of the stages, from numbers of rays and pixels.
-//! * `work`, `scene`: number and size of the images, from an artifact of `prep` or from the data
-//!   set.
-//! * `path`: number and size of the frames along a `camera-path`.
-//! * `machine`: speed of this machine, by a measurement of a few milliseconds.
+//! * `costs`: models of the stages, from numbers of rays and pixels, and the speed of this machine,
+//!   by a measurement of a few milliseconds.
+//! * `work`, `scene`: number and size of the images, from an artifact of `prep`, from the data set,
+//!   or of the frames along a `camera-path`.
 //! * `text`: estimates as text, before and after a run.
 //!
 //! The nearest earlier run of the stage on this machine corrects the model's estimate.
 
 mod costs;
-mod machine;
-mod path;
 mod scene;
 mod text;
 mod work;
@@ -25,8 +22,8 @@ use store::{ModelCost, Record, Store, host_name};
 pub(crate) use text::{check_memory, comparison_text, run_text, total_comparison_text};
 
 use crate::planned::Planned;
-use costs::{min_memory, model_cost};
-use scene::SceneImages;
+use costs::{min_memory, model_cost, slowness};
+use scene::{SceneImages, computed_frames, recorded_frames};
 use work::{Images, Work};
 
 /// Minimum processor seconds of an earlier run that corrects an estimate, and maximum factor
@@ -121,7 +118,7 @@ impl<'a> Estimator<'a> {
         let model = model_cost(program, &node.parameters, &work)?;
         let earlier =
             self.nearest(node, state, model).and_then(|record| corrections(record, model));
-        let (time, memory) = earlier.unwrap_or_else(|| (machine::slowness(), 1.0));
+        let (time, memory) = earlier.unwrap_or_else(|| (slowness(), 1.0));
         let min_memory = min_memory(program, &node.parameters, &work)?;
         Some(Estimate {
             processor_seconds: time * model.processor_seconds,
@@ -219,8 +216,8 @@ impl<'a> Estimator<'a> {
         let (index, _) = parent(path, "cameras")?;
         let recorded = path.inputs.iter().find(|input| input.name == "path");
         let frames = match recorded.map(|input| &input.from) {
-            None => path::computed(&path.parameters, self.scenes.get(&index)?),
-            Some(Origin::Folder(folder)) => path::recorded(&path.parameters, folder),
+            None => computed_frames(&path.parameters, self.scenes.get(&index)?),
+            Some(Origin::Folder(folder)) => recorded_frames(&path.parameters, folder),
             Some(Origin::Node { .. }) => None,
         };
         Some((index, frames?))

@@ -7,5 +7,5 @@ mod slurm;
 
 pub(crate) use budget::Budget;
 pub(crate) use local::Local;
-pub(crate) use node::NodeJob;
+pub(crate) use node::{Lookup, NodeJob};
 pub(crate) use slurm::{Cluster, JOB_VERB};

@@ -45,21 +45,14 @@ pub(crate) struct NodeJob<'a> {
 }
 
 impl NodeJob<'_> {
-    /// Returns the node's record, after running the node if it isn't cached.
-    pub(crate) fn find_or_run(&self) -> anyhow::Result<Record> {
-        match self.look_up()? {
-            Lookup::Cached(record) => Ok(record),
-            Lookup::Pending(pending) => self.carry_out(pending).map(|(record, _)| record),
-        }
-    }
-
     /// Looks up the node's record. Cached or not, the node's key is first written to the run's
     /// file, which protects the artifact from garbage collection.
     pub(crate) fn look_up(&self) -> anyhow::Result<Lookup> {
         let inputs = hash_inputs(self.node, self.run.store, Some(self.run.stop), |index| {
             self.output_of(index)
         })?;
-        let key_parts = planning::key_parts(self.node, &inputs.hashes, self.device());
+        let key_parts =
+            planning::key_parts(self.node, &inputs.hashes, self.run.plan.device(&self.node.stage));
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
         self.run.file.record_action(&entered, &self.node.stage, &key)?;
@@ -100,10 +93,6 @@ impl NodeJob<'_> {
 
     fn output_of(&self, index: usize) -> String {
         self.parents[&index].output.clone()
-    }
-
-    fn device(&self) -> &str {
-        self.run.plan.device(&self.node.stage)
     }
 
     fn report(&self, text: &str) {
@@ -184,7 +173,7 @@ impl NodeJob<'_> {
             output: &attempt.output,
             work: Some(&attempt.work),
             from_checkpoint: false,
-            device: self.device(),
+            device: self.run.plan.device(&self.node.stage),
             threads: self.threads,
             lock: Some(lock.file()),
         };

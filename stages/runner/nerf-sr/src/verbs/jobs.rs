@@ -15,7 +15,7 @@ use store::{Record, Store};
 
 use super::run::begin_run;
 use crate::estimates::Estimates;
-use crate::execute::NodeJob;
+use crate::execute::{Lookup, NodeJob};
 use crate::run_record::RunProgress;
 use crate::session::Run;
 use crate::sink::run_sink;
@@ -120,7 +120,10 @@ fn run_task(run: &Run<'_>, command: Vec<String>) -> anyhow::Result<()> {
         node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
     let display = &Display::new();
     let job = NodeJob { run, node, parents, threads, display, estimate: None, watch: None };
-    job.find_or_run().map(drop)
+    if let Lookup::Pending(pending) = job.look_up()? {
+        job.carry_out(pending)?;
+    }
+    Ok(())
 }
 
 /// Fails if a parent has no record. A job may start without its parents, because Slurm treats a

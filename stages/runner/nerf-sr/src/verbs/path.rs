@@ -8,10 +8,9 @@ use crate::session::{Session, nodes_of_stage};
 /// Prints the path of a stage's artifact, or of a folder or file in it, one line per point of a
 /// sweep.
 pub(crate) fn path(session: &Session, stage_path: &str, request: &Request) -> anyhow::Result<()> {
-    let (stage, inner) = match stage_path.split_once('/') {
-        Some((stage, inner)) => (stage, Some(inner)),
-        None => (stage_path, None),
-    };
+    let (stage, inner) = stage_path
+        .split_once('/')
+        .map_or((stage_path, None), |(stage, inner)| (stage, Some(inner)));
     if let Some(inner) = inner.filter(|inner| !inner.is_empty()) {
         relative_path(inner).usage(stage_path)?;
     }

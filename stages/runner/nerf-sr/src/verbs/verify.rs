@@ -124,11 +124,8 @@ impl Tally {
             line += &format!(", {unreadable} unreadable");
         }
         print_line!("{line}");
-        if damaged_artifacts + damaged_records + unreadable == 0 {
-            ExitCode::SUCCESS
-        } else {
-            ExitCode::from(3)
-        }
+        let is_sound = damaged_artifacts + damaged_records + unreadable == 0;
+        if is_sound { ExitCode::SUCCESS } else { ExitCode::from(3) }
     }
 }
 
