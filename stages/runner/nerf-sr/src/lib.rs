@@ -4,8 +4,7 @@
 //!
 //! * `cli`, `session`, `verbs`: the command line, its pipeline and store, and one function per
 //!   verb.
-//! * `starter`: the pipeline file that `init` writes. `stage_inputs`: inputs that the command line
-//!   gives by a stage's name.
+//! * `starter`: the pipeline file that `init` writes.
 //! * `execute`: carries out a plan on this machine or as a cluster's jobs, each node under its
 //!   key's lock. `unchanged` checks that programs and inputs stay the same while a stage runs.
 //!   `waiting` waits for locks; `run_messages` has the messages at the end of a run.
@@ -31,7 +30,6 @@ mod run_messages;
 mod run_record;
 mod session;
 mod sink;
-mod stage_inputs;
 mod starter;
 mod unchanged;
 mod verbs;

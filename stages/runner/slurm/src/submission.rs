@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::SlurmError;
 use crate::resources::Resources;
 use crate::site::Site;
+use crate::submit::SubmitOptions;
 
 /// A task for a job.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -74,16 +75,12 @@ impl Submission {
         self.folder.join(SCRIPT)
     }
 
-    /// Writes the folder, whole or not at all. The script calls `command` with the folder and a
-    /// task's number.
-    pub(crate) fn write(
-        &self,
-        plan: &[u8],
-        site: &Site,
-        command: &[&OsStr],
-    ) -> Result<(), SlurmError> {
+    /// Writes the folder, whole or not at all. The script calls the command with the folder and
+    /// a task's number.
+    pub(crate) fn write(&self, options: &SubmitOptions<'_>) -> Result<(), SlurmError> {
+        let SubmitOptions { plan, site, command, .. } = options;
         let partial = self.folder.with_file_name(format!(".{}.new", self.id));
-        let command = [command, &[self.folder.as_os_str()]].concat();
+        let command = [*command, &[self.folder.as_os_str()]].concat();
         let tasks =
             serde_json::to_vec(&self.tasks).map_err(|e| SlurmError::file(&self.folder, e))?;
         fs::create_dir_all(&partial)
@@ -167,6 +164,7 @@ fn shell_quoted(word: &[u8]) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::commands::Slurm;
     use std::process::Command;
 
     fn task(identity: &str) -> Task {
@@ -182,9 +180,17 @@ mod tests {
     fn submissions_are_read_back() {
         let root = tempfile::tempdir().unwrap();
         assert!(list_submissions(root.path()).unwrap().is_empty());
+        let options = SubmitOptions {
+            slurm: &Slurm::default(),
+            site: &Site::default(),
+            command: &[OsStr::new("true")],
+            plan: b"{}",
+            working_folder: Path::new("/work"),
+            is_stopped: &|| false,
+        };
         for id in ["b", "a"] {
             let submission = Submission::new(root.path(), id, vec![task("x"), task(id)]);
-            submission.write(b"{}", &Site::default(), &[OsStr::new("true")]).unwrap();
+            submission.write(&options).unwrap();
             fs::write(submission.log_path(1), id).unwrap();
         }
         fs::create_dir(root.path().join("slurm/.c.new")).unwrap();

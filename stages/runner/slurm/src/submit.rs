@@ -75,7 +75,7 @@ impl Submission {
                 continue;
             }
             if submitted.jobs.is_empty() {
-                self.write(options.plan, options.site, options.command)?;
+                self.write(options)?;
             }
             match self.submit_task(number, &ids, options) {
                 Ok(id) => {
@@ -105,7 +105,7 @@ impl Submission {
             parents.iter().filter_map(|&parent| ids[parent].as_deref()).collect();
         after.sort_unstable_by_key(|id| (id.len(), *id));
         after.dedup();
-        options.slurm.sbatch(&self.arguments(number, options.site, &after, options.working_folder))
+        options.slurm.sbatch(&self.arguments(number, &after, options))
     }
 
     /// Returns the arguments of `sbatch` for a task's job. `after` are the IDs of jobs that must
@@ -113,10 +113,10 @@ impl Submission {
     fn arguments(
         &self,
         number: usize,
-        site: &Site,
         after: &[&str],
-        working_folder: &Path,
+        options: &SubmitOptions<'_>,
     ) -> Vec<OsString> {
+        let SubmitOptions { site, working_folder, .. } = options;
         let Task { label, resources, .. } = &self.tasks[number];
         let printable = label.chars().map(|c| if c.is_control() { ' ' } else { c });
         let name: String = printable.take(MAX_NAME_CHARS).collect();
@@ -347,8 +347,16 @@ mod tests {
         };
         let site: Site = serde_yaml::from_str(site).unwrap();
         let submission = Submission::new(Path::new("/s/50%"), "a", vec![Task::default(), task]);
+        let options = SubmitOptions {
+            slurm: &Slurm::default(),
+            site: &site,
+            command: &[],
+            plan: b"{}",
+            working_folder: Path::new("/work"),
+            is_stopped: &|| false,
+        };
         let arguments: Vec<String> = submission
-            .arguments(1, &site, after, Path::new("/work"))
+            .arguments(1, after, &options)
             .into_iter()
             .map(|argument| argument.into_string().unwrap())
             .collect();

@@ -110,9 +110,6 @@ impl Local {
     }
 }
 
-/// Report of a worker: the node, its record, and whether the stage ran.
-type WorkerReport = (usize, anyhow::Result<(Record, bool)>);
-
 /// Runs the nodes. Returns their progress, and the number of nodes that were skipped because of
 /// failures.
 fn run_nodes(run: &Run<'_>, options: &Local) -> (RunProgress, usize) {
@@ -133,7 +130,7 @@ fn run_nodes(run: &Run<'_>, options: &Local) -> (RunProgress, usize) {
             ..RunProgress::default()
         },
     };
-    let (sender, reports) = mpsc::channel::<WorkerReport>();
+    let (sender, reports) = mpsc::channel();
     std::thread::scope(|scope| {
         loop {
             schedule.look_up_nodes();
@@ -145,8 +142,8 @@ fn run_nodes(run: &Run<'_>, options: &Local) -> (RunProgress, usize) {
             if schedule.running.is_empty() {
                 break;
             }
-            let Ok(report) = reports.recv() else { break };
-            schedule.finish(report);
+            let Ok((index, result)) = reports.recv() else { break };
+            schedule.finish(index, result);
         }
     });
     let skipped = schedule.pending.len() + schedule.ready.len();
@@ -272,8 +269,8 @@ impl<'a> Schedule<'a> {
         admitted
     }
 
-    /// Takes in a worker's report.
-    fn finish(&mut self, (index, result): WorkerReport) {
+    /// Takes in a worker's result: the record, and whether the stage ran.
+    fn finish(&mut self, index: usize, result: anyhow::Result<(Record, bool)>) {
         self.running.remove(&index);
         match result {
             Ok((record, ran)) => {

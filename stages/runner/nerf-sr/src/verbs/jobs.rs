@@ -51,7 +51,10 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let frozen = FrozenPlan::read(&Submission::plan_path(folder))?;
     let plan = frozen.task_plan(number)?;
     let result = begin_run(&store, &plan, &stop).and_then(|(file, _)| {
-        let command = submission_command(&store, folder);
+        // The command line of the run that wrote the submission, unless its file was deleted.
+        let id = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let submitting = store.run_or_pin(id).ok().flatten();
+        let command = submitting.map(|run| run.command).unwrap_or_default();
         let (plan, store, out) = (&plan, &store, frozen.out.as_path());
         // No estimates: those of the submitting machine may not be valid on this one.
         let estimates = &Estimates::default();
@@ -67,14 +70,6 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
         requeue(&plan, &store)?;
     }
     Ok(ExitCode::from(code))
-}
-
-/// Returns the command line of the run that wrote a submission; empty if the run's file was
-/// deleted.
-fn submission_command(store: &Store, folder: &Path) -> Vec<String> {
-    let id = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-    let run = store.run_or_pin(id).ok().flatten();
-    run.map(|run| run.command).unwrap_or_default()
 }
 
 /// Puts the job back into the queue if its stage has left a checkpoint. Without one, the job would

@@ -26,38 +26,27 @@ impl<'a> Chain<'a> {
         node: usize,
         folder_of: &dyn Fn(&Origin) -> Option<PathBuf>,
     ) -> Option<Self> {
-        (0..plan.nodes.len()).find_map(|index| {
-            let render = Link::new(plan, index, node, "views", folder_of)?;
-            let score = (0..plan.nodes.len())
-                .find_map(|next| Link::new(plan, next, index, "metrics", folder_of))?;
+        // Creates the link of node `index` if node `before` is one of its inputs and `kind` is its
+        // output's kind.
+        let link = |index: usize, before: usize, kind: &str| {
+            let node = &plan.nodes[index];
+            let description = &node.program.description;
+            let output = Origin::Node { index: before, subtree: None };
+            let chained = node.inputs.iter().find(|input| input.from == output);
+            let chained_input = chained.filter(|_| description.output.kind == kind)?.name.as_str();
+            let mut inputs = Vec::new();
+            for input in &node.inputs {
+                if input.name != chained_input && !description.inputs[&input.name].optional {
+                    inputs.push((input.name.as_str(), folder_of(&input.from)?));
+                }
+            }
+            Some(Link { node, device: plan.device(&node.stage), chained_input, inputs })
+        };
+        let indices = 0..plan.nodes.len();
+        indices.clone().find_map(|index| {
+            let render = link(index, node, "views")?;
+            let score = indices.clone().find_map(|next| link(next, index, "metrics"))?;
             Some(Self { render, score })
         })
-    }
-}
-
-impl<'a> Link<'a> {
-    /// Creates the link of node `index` if node `before` is one of its inputs and `kind` is its
-    /// output's kind.
-    fn new(
-        plan: &'a Plan,
-        index: usize,
-        before: usize,
-        kind: &str,
-        folder_of: &dyn Fn(&Origin) -> Option<PathBuf>,
-    ) -> Option<Self> {
-        let node = &plan.nodes[index];
-        let description = &node.program.description;
-        if description.output.kind != kind {
-            return None;
-        }
-        let output = Origin::Node { index: before, subtree: None };
-        let chained_input = node.inputs.iter().find(|input| input.from == output)?.name.as_str();
-        let mut inputs = Vec::new();
-        for input in &node.inputs {
-            if input.name != chained_input && !description.inputs[&input.name].optional {
-                inputs.push((input.name.as_str(), folder_of(&input.from)?));
-            }
-        }
-        Some(Self { node, device: plan.device(&node.stage), chained_input, inputs })
     }
 }
