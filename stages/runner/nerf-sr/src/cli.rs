@@ -18,7 +18,6 @@ use crate::garbage::Policy;
 use crate::session::Session;
 use crate::verbs;
 use crate::verbs::advise::Limits;
-use crate::verbs::graph::GraphFormat;
 use crate::watch::Watch;
 
 const DEFAULT_PIPELINE: &str = "pipeline.yaml";
@@ -221,7 +220,7 @@ enum Verb {
         plan: PlanArgs,
         /// Output format
         #[arg(long, value_enum, default_value = "text")]
-        format: GraphFormat,
+        format: verbs::graph::Format,
     },
     /// Print the log of a stage
     Log {

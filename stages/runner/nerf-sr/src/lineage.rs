@@ -28,10 +28,7 @@ pub(crate) struct StageDifference {
 impl Lineage {
     /// Reads the records of keys and of their ancestors. Records that garbage collection has
     /// deleted are skipped.
-    pub(crate) fn read(
-        store: &Store,
-        keys: impl IntoIterator<Item = String>,
-    ) -> anyhow::Result<Self> {
+    pub(crate) fn read(store: &Store, keys: BTreeSet<String>) -> anyhow::Result<Self> {
         let mut open: Vec<String> = keys.into_iter().collect();
         let mut seen: BTreeSet<String> = BTreeSet::new();
         let mut found: Vec<Record> = Vec::new();

@@ -183,14 +183,10 @@ fn data_sets(plan: &Plan, nodes: BTreeSet<usize>) -> Vec<String> {
     found.into_iter().collect()
 }
 
-/// Returns the shown results, each as its data sets, stage and point. `indices` are those of the
-/// recorded nodes.
-pub(crate) fn shown_results(
-    record: &RunRecord,
-    plan: &Plan,
-    indices: &[usize],
-) -> BTreeSet<String> {
-    let shown = record.nodes.iter().zip(indices).filter(|(node, _)| node.is_shown);
+/// Returns the shown results, each as its data sets, stage and point. `nodes` are the
+/// indices of the recorded nodes in the plan.
+pub(crate) fn shown_results(record: &RunRecord, plan: &Plan, nodes: &[usize]) -> BTreeSet<String> {
+    let shown = record.nodes.iter().zip(nodes).filter(|(node, _)| node.is_shown);
     let results = shown.map(|(node, index)| {
         let data_sets = data_sets(plan, BTreeSet::from([*index])).join(", ");
         format!("{data_sets}: {}", artifact::label(&node.stage, &node.point))

@@ -87,13 +87,8 @@ pub(crate) fn total_comparison_text<'a>(
     })
 }
 
-/// Fails if a node needs more than the free memory, if that is known.
-pub(crate) fn check_memory(
-    plan: &Plan,
-    estimates: &Estimates,
-    free: Option<u64>,
-) -> Result<(), Failure> {
-    let Some(free) = free else { return Ok(()) };
+/// Fails if a node needs more than the free memory.
+pub(crate) fn check_memory(plan: &Plan, estimates: &Estimates, free: u64) -> Result<(), Failure> {
     let Some((index, estimate)) = estimates.nodes.iter().find(|(_, node)| node.min_memory > free)
     else {
         return Ok(());

@@ -29,14 +29,10 @@ const DEFAULT_DEMAND: Demand = Demand { cores: 1, memory: 0 };
 
 impl Demand {
     /// Estimates a stage's demand from its measured run with the nearest key.
-    pub(crate) fn estimate(
-        key_parts: &Map<String, Value>,
-        stage: &str,
-        records: &[Record],
-    ) -> Self {
+    pub(crate) fn estimate(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Self {
         let measured =
             records.iter().filter(|record| record.peak_memory.is_some() && record.stage == stage);
-        let Some(record) = nearest_record(key_parts, measured) else { return DEFAULT_DEMAND };
+        let Some(record) = nearest_record(parts, measured) else { return DEFAULT_DEMAND };
         // Short stages may have measured 0 seconds; the minimum was chosen by hand.
         let seconds = record.seconds.max(1e-3);
         let cores = record.processor_seconds.map_or(1, |busy| (busy / seconds).round() as usize);

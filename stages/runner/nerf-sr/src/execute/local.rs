@@ -38,7 +38,7 @@ impl Local {
     /// Runs missing nodes, then the sinks. Returns the run's exit code.
     pub(crate) fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
         let plan = run.plan;
-        let free = available_memory()?.into_iter().chain([self.budget.memory]).min();
+        let free = available_memory()?.unwrap_or(u64::MAX).min(self.budget.memory);
         check_memory(plan, run.estimates, free)?;
         if let Some(text) = run_text(plan, run.estimates, self.budget.cores) {
             report_text(&format!("nerf-sr: {text}"));

@@ -1,3 +1,5 @@
+use std::collections::BTreeSet;
+
 use artifact::{bail_bad_input, print_line};
 use planning::{Change, PlanError, Request, State};
 
@@ -59,7 +61,7 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
                     "several artifacts' hashes begin with this; give more characters",
                 ));
             }
-            return Lineage::read(store, [record.key()]);
+            return Lineage::read(store, BTreeSet::from([record.key()]));
         }
     }
     read_stage(session, text)
@@ -77,7 +79,7 @@ fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let State::Cached(record) = &planned.states[index] else {
         bail_bad_input!("{text} has no artifact yet; run it first");
     };
-    Lineage::read(&session.store, [record.key()])
+    Lineage::read(&session.store, BTreeSet::from([record.key()]))
 }
 
 /// Parses a stage with the arguments of a plan; words are split as by a POSIX shell.

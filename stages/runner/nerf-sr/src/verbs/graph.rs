@@ -6,22 +6,18 @@ use crate::session::Session;
 /// Output format of `graph`.
 // Values have no doc comments: clap would give every verb's help its long form.
 #[derive(Clone, Copy, clap::ValueEnum)]
-pub(crate) enum GraphFormat {
+pub(crate) enum Format {
     Text,
     Dot,
 }
 
 /// Draws the plan as text or for Graphviz.
-pub(crate) fn graph(
-    session: &Session,
-    request: &Request,
-    format: GraphFormat,
-) -> anyhow::Result<()> {
+pub(crate) fn graph(session: &Session, request: &Request, format: Format) -> anyhow::Result<()> {
     let planned = session.plan_with_states(request)?;
     let vertices = vertices(&planned.plan, &planned.states);
     print_lines(&match format {
-        GraphFormat::Text => draw_as_text(&vertices),
-        GraphFormat::Dot => draw_for_graphviz(&vertices),
+        Format::Text => draw_as_text(&vertices),
+        Format::Dot => draw_for_graphviz(&vertices),
     });
     Ok(())
 }
