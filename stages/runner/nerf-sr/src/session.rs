@@ -70,7 +70,7 @@ impl Session {
             let plan = Plan::new(&pipeline, &self.store, request, describing)?;
             Ok(Plan { devices: self.devices.clone(), ..plan })
         };
-        let plan = plan_of(&with_stages_folders(&pipeline, &self.store, &request, plan_of)?)?;
+        let plan = plan_of(&with_artifact_folders(&pipeline, &self.store, &request, plan_of)?)?;
         check_not_in_input(&plan, "the store", self.store.root())?;
         for note in &plan.notes {
             report_text(note);
@@ -211,13 +211,13 @@ pub(crate) fn node_identities(
     Ok(identities)
 }
 
-/// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts: `-i init=train-ss` is
-/// the artifact that `train-ss` has without this argument. An existing file of that name has
-/// priority. The artifact is that of the same command line, without the argument and
-/// without the stage's own parameters, which are those of the training that continues. Only the
-/// stages' names in earlier arguments have been replaced in that command line. `new_plan` creates a
-/// plan of the pipeline.
-fn with_stages_folders(
+/// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts: `-i init=train-ss`
+/// is the artifact that `train-ss` has without this argument. An existing file of that name has
+/// priority. The artifact is that of the same command line, without the argument and without the
+/// stage's own parameters, which are those of the training that continues. Only the stages' names
+/// in earlier arguments have been replaced in that command line. `new_plan` creates a plan of the
+/// pipeline.
+fn with_artifact_folders(
     pipeline: &Pipeline,
     store: &Store,
     request: &Request,
