@@ -18,7 +18,7 @@ fn main() {
         .expect("the folder can be written");
 }
 
-/// Returns Rust tuples of the files in a folder of the repository.
+/// Returns Rust tuples of the folder, names and texts of a folder's files in the repository.
 fn targets(folder: &str, repository: &Path) -> String {
     let shelf = repository.join(folder).canonicalize().expect("the repository has the folder");
     println!("cargo::rerun-if-changed={}", shelf.display());
@@ -28,11 +28,9 @@ fn targets(folder: &str, repository: &Path) -> String {
         .filter(|path| path.extension().is_some_and(|extension| extension == "yaml"))
         .collect();
     files.sort();
-    files.iter().map(|file| target(folder, file)).collect()
-}
-
-/// Returns a Rust tuple of a file's folder, name and text.
-fn target(folder: &str, file: &Path) -> String {
-    let name = file.file_name().and_then(|name| name.to_str()).expect("the name is UTF-8");
-    format!("    ({folder:?}, {name:?}, include_str!({file:?})),\n")
+    let target = |file: &PathBuf| {
+        let name = file.file_name().and_then(|name| name.to_str()).expect("the name is UTF-8");
+        format!("    ({folder:?}, {name:?}, include_str!({file:?})),\n")
+    };
+    files.iter().map(target).collect()
 }

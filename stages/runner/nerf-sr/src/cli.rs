@@ -8,15 +8,16 @@ use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use artifact::{Failure, bail_usage};
 use clap::{Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::{Memory, Site};
 
-use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
+use crate::execute::{Budget, Cluster, JOB_VERB, Local};
 use crate::garbage::Policy;
-use crate::run_messages::FailureHint;
 use crate::session::Session;
-use crate::verbs::{self, GcOutput, GraphFormat, Limits};
+use crate::verbs;
+use crate::verbs::advise::Limits;
 use crate::watch::Watch;
 
 const DEFAULT_PIPELINE: &str = "pipeline.yaml";
@@ -59,7 +60,7 @@ enum ExecutorKind {
 }
 
 // Arguments from which a plan is created.
-#[derive(Args, Default)]
+#[derive(Args)]
 struct PlanArgs {
     /// Targets: stages of the pipeline, or files in pipelines/ or experiments/ next to it [default:
     /// the pipeline's `default`]
@@ -77,13 +78,6 @@ struct PlanArgs {
     /// field of train-ss further
     #[arg(short = 'i', long = "input", value_name = "[STAGE.]NAME=DIR[,DIR…]")]
     inputs: Vec<String>,
-    #[command(flatten)]
-    experiment: ExperimentArgs,
-}
-
-// Selection from an experiment.
-#[derive(Args, Default)]
-struct ExperimentArgs {
     /// Scenes of an experiment: folders in --data, or `demo` [default: those that its file names]
     #[arg(long = "scene", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     scenes: Vec<String>,
@@ -110,12 +104,12 @@ struct ExperimentArgs {
 #[derive(Args)]
 struct RunOptions {
     /// Maximum number of stages that run at once [default: number of cores, at most 4]
-    #[arg(short, long, value_name = "N")]
-    jobs: Option<usize>,
+    #[arg(short, long, value_name = "N", value_parser = positive_count)]
+    jobs: Option<NonZeroUsize>,
     /// Number of processors that all stages share, and of threads that each stage starts. Results
     /// don't depend on the number [default: processors of this process]
-    #[arg(long, value_name = "N")]
-    threads: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = positive_count)]
+    threads: Option<NonZeroUsize>,
     /// Memory limit for all stages together, such as 8G. A stage needs the peak memory of its last
     /// run [default: all memory]
     #[arg(long, value_name = "AMOUNT")]
@@ -180,13 +174,8 @@ enum Verb {
     Advise {
         #[command(flatten)]
         plan: PlanArgs,
-        /// Time that the run may take; the best quality within it is chosen [without a limit:
-        /// balanced]
-        #[arg(long, value_name = "N")]
-        minutes: Option<f64>,
-        /// Memory limit of the run, such as 8G; the best quality whose largest stage fits is chosen
-        #[arg(long, value_name = "AMOUNT")]
-        memory: Option<Memory>,
+        #[command(flatten)]
+        limits: Limits,
     },
     /// Explain why a stage is cached, would run, or waits
     Why {
@@ -231,7 +220,7 @@ enum Verb {
         plan: PlanArgs,
         /// Output format
         #[arg(long, value_enum, default_value = "text")]
-        format: GraphFormat,
+        format: verbs::graph::Format,
     },
     /// Print the log of a stage
     Log {
@@ -265,15 +254,8 @@ enum Verb {
         /// Only print what would be deleted
         #[arg(long)]
         dry_run: bool,
-        /// Keep artifacts that were created or used in the last N days
-        #[arg(long, default_value_t = 7, value_name = "N")]
-        keep_days: u64,
-        /// Delete checkpoints of interrupted stages, too
-        #[arg(long)]
-        drop_unfinished: bool,
-        /// Delete artifacts of older versions of nerf-sr, too; no plan can use them any more
-        #[arg(long)]
-        drop_old: bool,
+        #[command(flatten)]
+        policy: Policy,
         /// Print JSON
         #[arg(long)]
         json: bool,
@@ -298,10 +280,14 @@ enum Verb {
 
 impl From<PlanArgs> for Request {
     fn from(args: PlanArgs) -> Self {
-        let ExperimentArgs { scenes, protocols, variants, first_variants, show, data } =
-            args.experiment;
-        let max_variants = first_variants.map(NonZeroUsize::get);
-        let selection = Selection { data, scenes, protocols, variants, max_variants, show };
+        let selection = Selection {
+            data: args.data,
+            scenes: args.scenes,
+            protocols: args.protocols,
+            variants: args.variants,
+            max_variants: args.first_variants.map(NonZeroUsize::get),
+            show: args.show,
+        };
         Self { targets: args.targets, parameters: args.parameters, inputs: args.inputs, selection }
     }
 }
@@ -321,49 +307,66 @@ pub(crate) fn plan_request(words: impl Iterator<Item = String>) -> Result<Reques
 /// Parses the command line and carries out its verb.
 pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
     let Cli { verb, global } = Cli::parse();
+    let session = || global.open_session();
     match verb {
-        Verb::Run { plan, options } => run(&global, plan, options),
-        Verb::Cancel { stage } => verbs::cancel(&global.open_session()?.store, stage.as_deref()),
-        Verb::Job { submission, number } => verbs::job(&submission, number),
-        Verb::Init { folder } => verbs::init(&folder, &global.pipeline),
-        Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json),
-        Verb::Advise { plan, minutes, memory } => {
-            let arguments = global.plan_arguments(&plan);
-            let limits = Limits { minutes, memory };
-            verbs::advise(&global.open_session()?, &plan.into(), limits, &arguments)
-        }
-        Verb::Why { stage, plan, json } => {
-            verbs::why(&global.open_session()?, &stage, &plan.into(), json)
-        }
-        Verb::Status { plan, json } => verbs::status(&global.open_session()?, &plan.into(), json),
-        Verb::Path { stage, plan } => verbs::path(&global.open_session()?, &stage, &plan.into()),
-        Verb::Diff { before, now, json } => {
-            verbs::diff(&global.open_session()?, &before, &now, json)
-        }
-        Verb::Graph { plan, format } => verbs::graph(&global.open_session()?, &plan.into(), format),
-        Verb::Log { stage, plan } => verbs::log(&global.open_session()?, &stage, &plan.into()),
-        Verb::Verify { remove } => verbs::verify(&global.open_session()?.store, remove),
-        Verb::Pin { name, plan } => verbs::pin(&global.open_session()?, &name, &plan.into()),
-        Verb::Unpin { name } => verbs::unpin(&global.open_session()?, &name),
-        Verb::Gc { plan, dry_run, keep_days, drop_unfinished, drop_old, json } => {
-            let policy = Policy { keep_days, drop_unfinished, drop_old };
-            verbs::gc(&global.open_session()?, &plan.into(), policy, GcOutput { dry_run, json })
-        }
+        Verb::Run { plan, options } => return run(&global, plan, options),
+        Verb::Job { submission, number } => return verbs::jobs::job(&submission, number),
+        Verb::Verify { remove } => return verbs::verify::verify(&session()?.store, remove),
         Verb::Describe { stage } => {
             let pipeline = Pipeline::read(&global.pipeline).map_err(PlanError::from)?;
-            verbs::describe(&pipeline, &stage, || Ok(global.open_session()?.store))
+            return verbs::standalone::describe(&pipeline, &stage, || Ok(session()?.store));
         }
-        Verb::Man { folder } => verbs::man(Cli::command(), &folder),
-        Verb::Completions { shell } => Ok(verbs::completions(shell, &mut Cli::command())),
+        Verb::Init { folder } => verbs::standalone::init(&folder, &global.pipeline)?,
+        Verb::Man { folder } => verbs::standalone::man(Cli::command(), &folder)?,
+        Verb::Completions { shell } => verbs::standalone::completions(shell, &mut Cli::command()),
+        Verb::Cancel { stage } => verbs::jobs::cancel(&session()?.store, stage.as_deref())?,
+        Verb::Plan { plan, json } => verbs::states::plan(&session()?, &plan.into(), json)?,
+        Verb::Advise { plan, limits } => {
+            let arguments = global.plan_arguments(&plan);
+            verbs::advise::advise(&session()?, &plan.into(), limits, &arguments)?;
+        }
+        Verb::Why { stage, plan, json } => {
+            verbs::states::why(&session()?, &stage, &plan.into(), json)?;
+        }
+        Verb::Status { plan, json } => verbs::states::status(&session()?, &plan.into(), json)?,
+        Verb::Path { stage, plan } => verbs::path::path(&session()?, &stage, &plan.into())?,
+        Verb::Diff { before, now, json } => verbs::diff::diff(&session()?, &before, &now, json)?,
+        Verb::Graph { plan, format } => verbs::graph::graph(&session()?, &plan.into(), format)?,
+        Verb::Log { stage, plan } => verbs::log::log(&session()?, &stage, &plan.into())?,
+        Verb::Pin { name, plan } => verbs::pin::pin(&session()?, &name, &plan.into())?,
+        Verb::Unpin { name } => verbs::pin::unpin(&session()?, &name)?,
+        Verb::Gc { plan, dry_run, policy, json } => {
+            verbs::gc::gc(&session()?, &plan.into(), policy, dry_run, json)?;
+        }
     }
+    Ok(ExitCode::SUCCESS)
 }
 
 fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Result<ExitCode> {
     let session = global.open_session()?;
-    let out = options.out.clone().unwrap_or_else(|| session.pipeline.project_folder().join("out"));
-    let hint = FailureHint::new(global.plan_arguments(&plan));
-    let executor = new_executor(global.executor, options, hint, &out)?;
-    verbs::run(&session, &plan.into(), &out, executor.as_ref())
+    let plan_arguments = global.plan_arguments(&plan);
+    let request = Request::from(plan);
+    let RunOptions { jobs, threads, memory, keep_going, out, watch, site } = options;
+    let out = out.unwrap_or_else(|| session.pipeline.project_folder().join("out"));
+    if global.executor == ExecutorKind::Local {
+        let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
+        let budget = Budget::new(jobs, threads, memory.map(Memory::bytes));
+        let executor = Local { budget, keep_going, plan_arguments, watch };
+        return verbs::run::run(&session, &request, &out, |run| executor.carry_out(run));
+    }
+    if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
+        bail_usage!(
+            "--jobs, --threads, --memory and --keep-going need --executor local; on a cluster, set \
+            `resources` in the pipeline"
+        );
+    }
+    if watch.is_some() {
+        bail_usage!(
+            "--watch needs --executor local: on a cluster, the runner exits before jobs run"
+        );
+    }
+    let site = Site::find(site.as_deref()).map_err(|e| Failure::Usage(e.to_string()))?;
+    verbs::run::run(&session, &request, &out, |run| Cluster { site }.carry_out(run))
 }
 
 impl GlobalArgs {
@@ -375,34 +378,25 @@ impl GlobalArgs {
 
     /// Returns the arguments that repeat this plan with another verb, without `--executor`.
     fn plan_arguments(&self, plan: &PlanArgs) -> Vec<String> {
-        let mut arguments = plan.targets.clone();
-        for (option, values) in [("-p", &plan.parameters), ("-i", &plan.inputs)] {
-            arguments.extend(values.iter().flat_map(|value| [option.to_owned(), value.clone()]));
-        }
-        let experiment = &plan.experiment;
-        for (option, names) in [
-            ("--scene", &experiment.scenes),
-            ("--protocol", &experiment.protocols),
-            ("--show", &experiment.show),
-        ] {
-            if !names.is_empty() {
-                arguments.extend([option.to_owned(), names.join(",")]);
-            }
-        }
-        for name in &experiment.variants {
-            arguments.extend(["--variant".to_owned(), name.clone()]);
-        }
+        let text = |path: &PathBuf| vec![path.to_string_lossy().into_owned()];
         let pipeline = Some(&self.pipeline).filter(|file| *file != Path::new(DEFAULT_PIPELINE));
-        for (option, value) in [
-            ("--first-variants", experiment.first_variants.map(|count| count.to_string())),
-            ("--data", experiment.data.as_deref().map(path_text)),
-            ("--pipeline", pipeline.map(|file| path_text(file))),
-            ("--store", self.store.as_deref().map(path_text)),
-            ("--device", Some(self.device.clone()).filter(|device| device != DEFAULT_DEVICE)),
-        ] {
-            if let Some(value) = value {
-                arguments.extend([option.to_owned(), value]);
-            }
+        let device = Some(&self.device).filter(|device| *device != DEFAULT_DEVICE);
+        let options = [
+            ("-p", plan.parameters.clone()),
+            ("-i", plan.inputs.clone()),
+            ("--scene", plan.scenes.clone()),
+            ("--protocol", plan.protocols.clone()),
+            ("--show", plan.show.clone()),
+            ("--variant", plan.variants.clone()),
+            ("--first-variants", plan.first_variants.iter().map(ToString::to_string).collect()),
+            ("--data", plan.data.as_ref().map(text).unwrap_or_default()),
+            ("--pipeline", pipeline.map(text).unwrap_or_default()),
+            ("--store", self.store.as_ref().map(text).unwrap_or_default()),
+            ("--device", device.into_iter().cloned().collect()),
+        ];
+        let mut arguments = plan.targets.clone();
+        for (option, values) in options {
+            arguments.extend(values.into_iter().flat_map(|value| [option.to_owned(), value]));
         }
         arguments
     }
@@ -410,36 +404,6 @@ impl GlobalArgs {
 
 fn positive_count(text: &str) -> Result<NonZeroUsize, String> {
     text.parse().map_err(|_| "expected a whole number of at least 1".to_owned())
-}
-
-fn path_text(path: &Path) -> String {
-    path.to_string_lossy().into_owned()
-}
-
-/// Creates the executor of a run. `hint` is printed after a failure; watched views are written
-/// below `out`.
-fn new_executor(
-    kind: ExecutorKind,
-    options: RunOptions,
-    hint: FailureHint,
-    out: &Path,
-) -> Result<Box<dyn Executor>, PlanError> {
-    let RunOptions { jobs, threads, memory, keep_going, site, watch, .. } = options;
-    if kind == ExecutorKind::Local {
-        let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
-        let budget = Budget::new(jobs, threads, memory.map(Memory::bytes))?;
-        return Ok(Box::new(Local { budget, keep_going, hint, watch }));
-    }
-    let problem = if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
-        "--jobs, --threads, --memory and --keep-going need --executor local; on a cluster, set \
-        `resources` in the pipeline"
-    } else if watch.is_some() {
-        "--watch needs --executor local: on a cluster, the runner exits before jobs run"
-    } else {
-        let site = Site::find(site.as_deref()).map_err(|e| PlanError::Usage(e.to_string()))?;
-        return Ok(Box::new(Cluster { site }));
-    };
-    Err(PlanError::Usage(problem.to_owned()))
 }
 
 #[cfg(test)]

@@ -4,39 +4,33 @@
 //!
 //! * `cli`, `session`, `verbs`: the command line, its pipeline and store, and one function per
 //!   verb.
-//! * `starter`: the pipeline file that `init` writes. `stage_inputs`: inputs that the command line
-//!   gives by a stage's name.
+//! * `starter`: the pipeline file that `init` writes.
 //! * `execute`: carries out a plan on this machine or as a cluster's jobs, each node under its
 //!   key's lock. `unchanged` checks that programs and inputs stay the same while a stage runs.
 //!   `waiting` waits for locks; `run_messages` has the messages at the end of a run.
 //! * `garbage`: deletes the artifacts that nothing needs.
 //! * `estimates`: processor time of the stages to run.
-//! * `identities`: identities of nodes whose keys aren't known yet.
-//! * `node_report`: a plan's nodes as JSON. `state_text`: their states as text. `lineage` compares
-//!   two results and their inputs.
+//! * `planned`: a plan's nodes with their states, as text and as JSON. `lineage` compares two
+//!   results and their inputs.
 //! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: gives the run's record (`run_record`) to stages that show it, such as the report, and
-//!   publishes their pages (`publish`, `page`, `archive`).
+//!   publishes their pages (`publish`, `page`).
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
-mod archive;
 mod cli;
 mod estimates;
 mod execute;
 mod garbage;
-mod identities;
 mod lineage;
-mod node_report;
 mod page;
+mod planned;
 mod publish;
 mod run_messages;
 mod run_record;
 mod session;
 mod sink;
-mod stage_inputs;
 mod starter;
-mod state_text;
 mod unchanged;
 mod verbs;
 mod waiting;
@@ -61,14 +55,21 @@ pub fn main() -> ExitCode {
     stage::install_panic_hook("nerf-sr");
     cli::run_command_line().unwrap_or_else(|error| {
         report_line!("nerf-sr: {}", artifact::one_line(&error));
-        let plan_error = error.chain().find_map(|e| e.downcast_ref::<PlanError>());
-        ExitCode::from(plan_error.map_or_else(|| artifact::exit_code(&error), plan_exit_code))
+        ExitCode::from(exit_code(&error))
     })
 }
 
-/// Returns a failure with exit code 1.
-fn failure(error: impl std::fmt::Display) -> StageFailure {
-    StageFailure { code: StageFailure::FAILED, message: error.to_string() }
+/// Returns the exit code of an error, by the first cause that has one.
+fn exit_code(error: &anyhow::Error) -> u8 {
+    let plan_error = error.chain().find_map(|e| e.downcast_ref::<PlanError>());
+    let stage_failure = error.chain().find_map(|e| e.downcast_ref::<StageFailure>());
+    let code = plan_error.map(plan_exit_code).or(stage_failure.map(|failure| failure.code));
+    code.unwrap_or_else(|| artifact::exit_code(error))
+}
+
+/// Converts an error to the failure of a stage.
+fn stage_failure(error: &anyhow::Error) -> StageFailure {
+    StageFailure { code: exit_code(error), message: artifact::one_line(error) }
 }
 
 fn plan_exit_code(error: &PlanError) -> u8 {

@@ -1,7 +1,6 @@
 //! Comparison of two results and of all actions that they depend on.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Damage, Manifest, label};
@@ -29,10 +28,7 @@ pub(crate) struct StageDifference {
 impl Lineage {
     /// Reads the records of keys and of their ancestors. Records that garbage collection has
     /// deleted are skipped.
-    pub(crate) fn read(
-        store: &Store,
-        keys: impl IntoIterator<Item = String>,
-    ) -> anyhow::Result<Self> {
+    pub(crate) fn read(store: &Store, keys: BTreeSet<String>) -> anyhow::Result<Self> {
         let mut open: Vec<String> = keys.into_iter().collect();
         let mut seen: BTreeSet<String> = BTreeSet::new();
         let mut found: Vec<Record> = Vec::new();
@@ -73,15 +69,17 @@ impl Lineage {
         let mut differences = Vec::new();
         for name in names {
             let (old, new) = (before.records.get(name), self.records.get(name));
-            let depth = match (old, new) {
-                (Some(old), Some(new)) if has_artifact(old, store) && has_artifact(new, store) => {
-                    Depth::Content
+            let [old, new] = if let (Some(old), Some(new)) = (old, new) {
+                let mut parts = [before.parts(old, store), self.parts(new, store)];
+                let manifests = [old, new].map(|record| store.manifest(&record.output));
+                if let [Ok(old_manifest), Ok(new_manifest)] = manifests {
+                    add_content(&mut parts[0], old, &old_manifest, store)?;
+                    add_content(&mut parts[1], new, &new_manifest, store)?;
                 }
-                (Some(_), Some(_)) => Depth::Key,
-                _ => Depth::Stage,
+                parts
+            } else {
+                [old, new].map(stage_part)
             };
-            let old = old.map_or(Ok(Map::new()), |record| before.parts(record, store, depth))?;
-            let new = new.map_or(Ok(Map::new()), |record| self.parts(record, store, depth))?;
             let changes = changes(&old, &new);
             if !changes.is_empty() {
                 differences.push(StageDifference { stage: name.clone(), changes });
@@ -90,64 +88,45 @@ impl Lineage {
         Ok(differences)
     }
 
-    /// Returns the comparable parts of a result, by name.
-    fn parts(
-        &self,
-        record: &Record,
-        store: &Store,
-        depth: Depth,
-    ) -> anyhow::Result<Map<String, Value>> {
-        let mut parts = Map::new();
-        for (name, value) in &record.key_parts {
-            let is_compared = match depth {
-                Depth::Stage => name == "stage",
-                _ => !(name.starts_with("input ") && self.is_from_parent(record, value, store)),
-            };
-            if is_compared {
-                parts.insert(name.clone(), value.clone());
-            }
-        }
-        if depth == Depth::Stage {
-            return Ok(parts);
-        }
-        let manifest = store.manifest(&record.output).ok();
-        let state = if manifest.is_some() { "kept" } else { "gone" };
+    /// Returns the parts of a result that don't need its artifact, by name.
+    fn parts(&self, record: &Record, store: &Store) -> Map<String, Value> {
+        let mut parts = record.key_parts.clone();
+        parts.retain(|name, value| {
+            !(name.starts_with("input ") && self.is_from_parent(record, value, store))
+        });
+        let state = if store.manifest(&record.output).is_ok() { "kept" } else { "gone" };
         parts.insert("artifact".to_owned(), Value::from(state));
-        if let Some(manifest) = manifest.filter(|_| depth == Depth::Content) {
-            add_content(&mut parts, record, &manifest, &store.object(&record.output))?;
-        }
-        Ok(parts)
+        parts
     }
 
     /// True if an input's hash is the artifact, or a folder of it, of a parent in this lineage.
     fn is_from_parent(&self, record: &Record, hash: &Value, store: &Store) -> bool {
         let mut parents = self.records.values().filter(|r| record.made_of.contains(&r.key()));
-        parents.any(|parent| is_hash_of(hash, &parent.output, store))
+        parents.any(|parent| {
+            let Ok(manifest) = store.manifest(&parent.output) else {
+                return *hash == parent.output;
+            };
+            let paths = manifest.files.iter().filter_map(|file| file.path.split_once('/'));
+            let folders: BTreeSet<&str> = paths.map(|(folder, _)| folder).collect();
+            *hash == parent.output
+                || folders.iter().any(|folder| *hash == manifest.subtree(folder).identity())
+        })
     }
 }
 
-/// Depth of a comparison.
-#[derive(Clone, Copy, PartialEq)]
-enum Depth {
-    /// The stage's name: one side doesn't have the stage.
-    Stage,
-    /// The key's parts: the artifact of one side was deleted.
-    Key,
-    /// The key's parts, metrics, files, and values that the scene decided.
-    Content,
+/// Returns the stage's name, the only part that is compared if one side doesn't have the stage.
+fn stage_part(record: Option<&Record>) -> Map<String, Value> {
+    let stage = record.and_then(|record| record.key_parts.get_key_value("stage"));
+    stage.map(|(name, value)| (name.clone(), value.clone())).into_iter().collect()
 }
 
-fn has_artifact(record: &Record, store: &Store) -> bool {
-    store.manifest(&record.output).is_ok()
-}
-
-/// Adds the hashes of an artifact's files. JSON files contribute their metrics and resolved
-/// defaults instead.
+/// Adds metrics, the hashes of files, and values that the scene decided. JSON files contribute
+/// their metrics and resolved defaults instead of their hashes.
 fn add_content(
     parts: &mut Map<String, Value>,
     record: &Record,
     manifest: &Manifest,
-    folder: &Path,
+    store: &Store,
 ) -> anyhow::Result<()> {
     for file in &manifest.files {
         if !file.path.ends_with(".json") {
@@ -157,7 +136,7 @@ fn add_content(
         if file.path.contains('/') {
             continue;
         }
-        let path = folder.join(&file.path);
+        let path = store.object(&record.output).join(&file.path);
         let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
         let Ok(json) = serde_json::from_slice::<Value>(&bytes) else { continue };
         // No record names the file of resolved defaults. Entries that aren't parameters belong to
@@ -185,15 +164,4 @@ fn add_numbers(parts: &mut Map<String, Value>, name: &str, value: &Value) {
         }
         _ => {}
     }
-}
-
-/// True if a hash is that of an artifact or of one of its folders.
-fn is_hash_of(hash: &Value, output: &str, store: &Store) -> bool {
-    if hash == output {
-        return true;
-    }
-    let Ok(manifest) = store.manifest(output) else { return false };
-    let folders: BTreeSet<&str> =
-        manifest.files.iter().filter_map(|file| Some(file.path.split_once('/')?.0)).collect();
-    folders.into_iter().any(|folder| *hash == manifest.subtree(folder).identity())
 }

@@ -1,7 +1,6 @@
 //! Publishing of a sink's page: the page is copied next to the old one, then exchanged for it
 //! atomically. A folder is replaced only if a sink wrote all of it and nobody has changed it
-//! ([`crate::page`]). A page that shows a result which the new one lacks is archived
-//! ([`crate::archive`]).
+//! ([`crate::page`]). A page that shows a result which the new one lacks is archived.
 //!
 //! A kill may leave one of these next to a target `NAME`; the next publishing finishes the work:
 //!
@@ -16,15 +15,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use anyhow::{Context as _, anyhow};
 use artifact::{Manifest, list_files};
-use planning::stage_call::StageFailure;
 use rustix::fs::{CWD, RenameFlags, renameat_with};
-use store::{Locked, StoreError, is_lock_acquired};
 
-use crate::archive::archive_path;
-use crate::failure;
-use crate::page::{PageMark, check_ownership};
-use crate::waiting::wait_for_lock;
+use crate::page::{PageMark, archive_path, check_ownership};
+use crate::waiting::lock_file;
 
 /// True if the target is a page with this identity and all its files, and a killed publishing left
 /// nothing of value next to it.
@@ -47,17 +43,23 @@ pub(crate) fn publish(
     target: &Path,
     kind: &str,
     stop: &AtomicBool,
-) -> Result<Vec<PathBuf>, StageFailure> {
+) -> anyhow::Result<Vec<PathBuf>> {
     let out = target.parent().unwrap_or(Path::new("."));
-    fs::create_dir_all(out).map_err(|e| StageFailure::at(out, &e))?;
-    let _lock = lock_folder(out, stop)?;
-    let mark = PageMark::read(output).map_err(|e| StageFailure::at(output, &e))?;
+    fs::create_dir_all(out).with_context(|| out.display().to_string())?;
+    // Runs with different stores may publish into the same folder, so the store's locks aren't
+    // enough.
+    let _lock = lock_file(out, File::options().read(true), stop)?;
+    let mark = PageMark::read(output).with_context(|| output.display().to_string())?;
     let publishing = Publishing { target, kind, mark: mark.unwrap_or_default() };
-    let mut archived = publishing.finish_earlier()?;
-    let replaced = publishing.replace(output);
-    remove_folder(&publishing.hidden("scrap")).ok();
-    archived.extend(replaced?);
-    Ok(archived)
+    let result = publishing.finish_earlier().and_then(|mut archived| {
+        archived.extend(publishing.replace(output)?);
+        Ok(archived)
+    });
+    remove_folder(&hidden(target, "scrap")).ok();
+    // Other errors name their files.
+    result.map_err(|error| {
+        if error.is::<io::Error>() { error.context(target.display().to_string()) } else { error }
+    })
 }
 
 /// A publishing in progress; the target's parent folder is locked.
@@ -69,28 +71,17 @@ struct Publishing<'a> {
 }
 
 impl Publishing<'_> {
-    fn hidden(&self, suffix: &str) -> PathBuf {
-        hidden(self.target, suffix)
-    }
-
-    fn failure(&self, error: &io::Error) -> StageFailure {
-        StageFailure::at(self.target, error)
-    }
-
     /// Finishes a killed publishing. Returns the new paths of its pages that were archived.
-    fn finish_earlier(&self) -> Result<Vec<PathBuf>, StageFailure> {
-        let (old, new) = (self.hidden("old"), self.hidden("new"));
-        let is_target_missing = !exists(self.target).map_err(|e| self.failure(&e))?;
-        if is_target_missing && exists(&old).map_err(|e| self.failure(&e))? {
-            fs::rename(&old, self.target).map_err(|e| self.failure(&e))?;
+    fn finish_earlier(&self) -> anyhow::Result<Vec<PathBuf>> {
+        let (old, new) = (hidden(self.target, "old"), hidden(self.target, "new"));
+        if !exists(self.target)? && exists(&old)? {
+            fs::rename(&old, self.target)?;
         }
         let mut archived = Vec::new();
         for leftover in [old, new] {
-            if exists(&leftover).map_err(|e| self.failure(&e))? {
+            if exists(&leftover)? {
                 self.check_ownership(&leftover)?;
-                archived.extend(
-                    self.archive_or_delete_leftover(&leftover).map_err(|e| self.failure(&e))?,
-                );
+                archived.extend(self.archive_or_delete_leftover(&leftover)?);
             }
         }
         Ok(archived)
@@ -110,25 +101,24 @@ impl Publishing<'_> {
 
     /// Replaces the target's page by a copy of `output`. Returns the new path of the old page if
     /// that was archived.
-    fn replace(&self, output: &Path) -> Result<Option<PathBuf>, StageFailure> {
-        let (scrap, staged) = (self.hidden("scrap"), self.hidden("new"));
-        remove_folder(&scrap)
-            .and_then(|()| copy_folder(output, &scrap))
-            .and_then(|()| fs::rename(&scrap, &staged))
-            .map_err(|e| StageFailure::at(&scrap, &e))?;
+    fn replace(&self, output: &Path) -> anyhow::Result<Option<PathBuf>> {
+        let (scrap, staged) = (hidden(self.target, "scrap"), hidden(self.target, "new"));
+        remove_folder(&scrap)?;
+        copy_folder(output, &scrap)?;
+        fs::rename(&scrap, &staged)?;
         if let Err(refused) = self.exchange(&staged) {
             self.delete(&staged).ok();
             return Err(refused);
         }
         // After the exchange the old page is there, if one existed.
         let replaced = staged;
-        self.archive_or_delete(&replaced, &self.mark).map_err(|e| StageFailure::at(&replaced, &e))
+        Ok(self.archive_or_delete(&replaced, &self.mark)?)
     }
 
     /// Exchanges a page and the target's page. If the target doesn't exist, the page is moved.
-    fn exchange(&self, page: &Path) -> Result<(), StageFailure> {
-        if !exists(self.target).map_err(|e| self.failure(&e))? {
-            return fs::rename(page, self.target).map_err(|e| self.failure(&e));
+    fn exchange(&self, page: &Path) -> anyhow::Result<()> {
+        if !exists(self.target)? {
+            return Ok(fs::rename(page, self.target)?);
         }
         self.check_ownership(self.target)?;
         let flags = RenameFlags::EXCHANGE;
@@ -137,11 +127,11 @@ impl Publishing<'_> {
         }
         // Not every file system can exchange two folders. Without that, the target doesn't exist
         // for a moment.
-        let old = self.hidden("old");
-        self.move_page(self.target, &old).map_err(|e| self.failure(&e))?;
+        let old = hidden(self.target, "old");
+        self.move_page(self.target, &old)?;
         let moved = fs::rename(page, self.target);
         let destination = if moved.is_ok() { page } else { self.target };
-        fs::rename(&old, destination).and(moved).map_err(|e| self.failure(&e))
+        Ok(fs::rename(&old, destination).and(moved)?)
     }
 
     /// Archives a page that one with the mark `newer` replaces, or deletes it if it isn't worth
@@ -165,7 +155,7 @@ impl Publishing<'_> {
     fn move_page(&self, page: &Path, new: &Path) -> io::Result<()> {
         match fs::rename(page, new) {
             Err(e) if e.kind() == io::ErrorKind::CrossesDevices => {
-                let scrap = self.hidden("scrap");
+                let scrap = hidden(self.target, "scrap");
                 remove_folder(&scrap)?;
                 copy_folder(page, &scrap)?;
                 fs::rename(&scrap, new)?;
@@ -178,7 +168,7 @@ impl Publishing<'_> {
     /// Deletes a folder that a sink wrote. The folder is renamed first, so that a kill leaves no
     /// partial page under a page's name.
     fn delete(&self, folder: &Path) -> io::Result<()> {
-        let scrap = self.hidden("scrap");
+        let scrap = hidden(self.target, "scrap");
         remove_folder(&scrap)?;
         match fs::rename(folder, &scrap) {
             Err(e) if e.kind() == io::ErrorKind::CrossesDevices => remove_folder(folder),
@@ -186,12 +176,12 @@ impl Publishing<'_> {
         }
     }
 
-    fn check_ownership(&self, folder: &Path) -> Result<(), StageFailure> {
+    fn check_ownership(&self, folder: &Path) -> anyhow::Result<()> {
         check_ownership(folder, self.kind).map_err(|reason| {
-            failure(format!(
+            anyhow!(
                 "{reason}; nothing was replaced: move that file or folder away, or choose another \
                 folder with --out"
-            ))
+            )
         })
     }
 }
@@ -200,20 +190,6 @@ impl Publishing<'_> {
 fn hidden(target: &Path, suffix: &str) -> PathBuf {
     let name = target.file_name().unwrap_or_default().to_string_lossy();
     target.with_file_name(format!(".{name}.nerf-sr-{suffix}"))
-}
-
-/// Locks a folder of pages. Runs with different stores may publish into the same folder, so the
-/// store's locks aren't enough.
-fn lock_folder(folder: &Path, stop: &AtomicBool) -> Result<File, StageFailure> {
-    wait_for_lock(stop, &|_, _| {}, || {
-        let file = File::open(folder)
-            .map_err(|source| StoreError::Io { path: folder.to_path_buf(), source })?;
-        Ok(if is_lock_acquired(folder, file.try_lock())? {
-            Locked::Acquired(file)
-        } else {
-            Locked::HeldBy(None)
-        })
-    })
 }
 
 /// Copies a folder and syncs its files, so that a full disk is noticed before a page is replaced.
@@ -230,7 +206,8 @@ fn copy_folder(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-fn exists(path: &Path) -> io::Result<bool> {
+/// Returns whether a file, folder or link exists.
+pub(crate) fn exists(path: &Path) -> io::Result<bool> {
     match path.symlink_metadata() {
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
         found => found.map(|_| true),

@@ -22,7 +22,7 @@ fn sink_output(dir: &Path, text: &str) -> PathBuf {
 }
 
 /// Publishes a sink's output as `out/report`.
-fn publish_output(dir: &Path, text: &str) -> Result<PathBuf, StageFailure> {
+fn publish_output(dir: &Path, text: &str) -> anyhow::Result<PathBuf> {
     let target = dir.join("out/report");
     publish(&sink_output(dir, text), &target, "page", &AtomicBool::new(false)).map(|_| target)
 }
@@ -225,7 +225,7 @@ fn leftovers_that_are_no_pages_are_not_archived() {
     ] {
         fs::rename(page(dir.path(), "lego 1", "lego", true), &leftover).unwrap();
         fs::write(leftover.join(file), "precious").unwrap();
-        let message = publish_output(dir.path(), "chair 3").unwrap_err().message;
+        let message = publish_output(dir.path(), "chair 3").unwrap_err().to_string();
         assert!(
             message.contains(expected) && message.contains("move that file or folder away"),
             "{message}"
@@ -283,7 +283,7 @@ fn foreign_files_are_not_replaced() {
         let target = publish_output(dir.path(), "one").unwrap();
         damage(&target);
         let before = all_files(&dir.path().join("out"));
-        let message = publish_output(dir.path(), "two").unwrap_err().message;
+        let message = publish_output(dir.path(), "two").unwrap_err().to_string();
         assert!(message.contains(expected) && message.contains("--out"), "{expected}: {message}");
         assert_eq!(all_files(&dir.path().join("out")), before, "{expected}");
     }

@@ -23,44 +23,19 @@ fn was_or_were(count: usize) -> &'static str {
     if count == 1 { "was" } else { "were" }
 }
 
-/// Message after a stage's failure, with the complete command that prints the stage's log.
-pub(crate) struct FailureHint {
-    program: String,
-    /// The user's arguments, without the verb and without options that only `run` has.
-    arguments: Vec<String>,
+/// Returns the message after a stage's failure. `skipped` is the number of stages that were not run
+/// because of the failure; `log_command` prints the stage's log.
+pub(crate) fn failure_message(label: &str, skipped: usize, log_command: &str) -> String {
+    let skipped = match skipped {
+        0 => String::new(),
+        n => format!("; {} {} not run", format_count(n, "stage"), was_or_were(n)),
+    };
+    format!("nerf-sr: {label} failed{skipped}; `{log_command}` prints the log")
 }
 
-impl FailureHint {
-    /// Creates a hint. `arguments` follow the stage's name in the command `nerf-sr log STAGE …`.
-    pub(crate) fn new(arguments: Vec<String>) -> Self {
-        let program = std::env::args_os()
-            .next()
-            .map_or_else(|| "nerf-sr".to_owned(), |p| p.to_string_lossy().into_owned());
-        Self { program, arguments }
-    }
-
-    /// Returns the command that prints a stage's log.
-    fn log_command(&self, stage: &str) -> String {
-        let mut words = vec![shell_quoted(&self.program), "log".to_owned(), shell_quoted(stage)];
-        words.extend(self.arguments.iter().map(|word| shell_quoted(word)));
-        words.join(" ")
-    }
-
-    /// Returns the message after a stage's failure. `skipped` is the number of stages that were not
-    /// run because of the failure.
-    pub(crate) fn message(&self, label: &str, stage: &str, skipped: usize) -> String {
-        let skipped = match skipped {
-            0 => String::new(),
-            n => format!("; {} {} not run", format_count(n, "stage"), was_or_were(n)),
-        };
-        format!("nerf-sr: {label} failed{skipped}; `{}` prints the log", self.log_command(stage))
-    }
-}
-
-/// Returns a command of this program as text, for a POSIX shell.
-pub(crate) fn command_text(arguments: &[String]) -> String {
-    let words = arguments.iter().map(|word| shell_quoted(word));
-    [&["nerf-sr".to_owned()], &words.collect::<Vec<_>>()[..]].concat().join(" ")
+/// Returns a command as text, for a POSIX shell.
+pub(crate) fn command_text<'a>(words: impl IntoIterator<Item = &'a str>) -> String {
+    words.into_iter().map(shell_quoted).collect::<Vec<_>>().join(" ")
 }
 
 /// Quotes a word for a POSIX shell where necessary.
@@ -101,17 +76,14 @@ mod tests {
 
     #[test]
     fn failures_name_the_command_of_the_log() {
-        let hint = FailureHint {
-            program: "nerf-sr".to_owned(),
-            arguments: vec!["-p".to_owned(), "x=a b".to_owned()],
-        };
-        let log = "`nerf-sr log prep -p 'x=a b'` prints the log";
+        let log = command_text(["nerf-sr", "log", "prep", "-p", "x=a b"]);
+        assert_eq!(log, "nerf-sr log prep -p 'x=a b'");
         for (skipped, between) in
             [(0, ""), (1, "; 1 stage was not run"), (2, "; 2 stages were not run")]
         {
             assert_eq!(
-                hint.message("prep [x=a b]", "prep", skipped),
-                format!("nerf-sr: prep [x=a b] failed{between}; {log}")
+                failure_message("prep [x=a b]", skipped, &log),
+                format!("nerf-sr: prep [x=a b] failed{between}; `{log}` prints the log")
             );
         }
     }

@@ -10,34 +10,28 @@ use store::{Record, Store};
 
 use crate::session::Run;
 
-/// Progress of a run.
-pub(crate) struct RunProgress<'a> {
+/// Progress of a run; by default, that before its first stage.
+#[derive(Default)]
+pub(crate) struct RunProgress {
     /// Records by node index; `None` if the node isn't done.
-    pub(crate) records: &'a [Option<Record>],
+    pub(crate) records: Vec<Option<Record>>,
     /// Nodes that ran; `None` if unknown.
-    pub(crate) ran: Option<&'a BTreeSet<usize>>,
+    pub(crate) ran: Option<BTreeSet<usize>>,
     /// Nodes that failed.
-    pub(crate) failures: &'a [(usize, StageFailure)],
+    pub(crate) failures: Vec<(usize, StageFailure)>,
     /// Command line of the run.
-    pub(crate) command: &'a [String],
+    pub(crate) command: Vec<String>,
 }
 
-impl<'a> RunProgress<'a> {
-    /// Returns the progress of a run before its first stage.
-    pub(crate) fn not_started(records: &'a [Option<Record>]) -> Self {
-        Self { records, ran: None, failures: &[], command: &[] }
-    }
-}
-
-/// Returns the record of the nodes that a sink shows and of their ancestors. `None` if one of them
-/// isn't done, unless the sink can show a part of a run. No artifact is read: values that the scene
-/// decides are missing, and so is everything that differs between two runs with equal results;
-/// [`add_details`] adds both.
+/// Returns the record of the nodes that a sink shows and of their ancestors, and the indices of the
+/// recorded nodes in the plan. `None` if one of them isn't done, unless the sink can show a part of
+/// a run. No artifact is read: values that the scene decides are missing, and so is everything that
+/// differs between two runs with equal results; [`add_details`] adds both.
 pub(crate) fn run_record(
     run: &Run<'_>,
     sink: &Sink,
-    progress: &RunProgress<'_>,
-) -> Option<RunRecord> {
+    progress: &RunProgress,
+) -> Option<(RunRecord, Vec<usize>)> {
     let plan = run.plan;
     let mut is_complete: Vec<bool> = Vec::with_capacity(plan.nodes.len());
     for (index, node) in plan.nodes.iter().enumerate() {
@@ -51,7 +45,7 @@ pub(crate) fn run_record(
         return None;
     }
     let (done, undone): (Vec<usize>, Vec<usize>) =
-        nodes_with_ancestors(plan, sink).into_iter().partition(|&index| is_complete[index]);
+        with_ancestors(plan, sink.nodes()).into_iter().partition(|&index| is_complete[index]);
     let recorded = recorded_nodes(&done, &shown);
     let done: Vec<usize> = recorded.iter().map(|(index, _)| *index).collect();
     let mut nodes = Vec::with_capacity(done.len());
@@ -59,9 +53,10 @@ pub(crate) fn run_record(
         let record = progress.records[index].as_ref()?;
         nodes.push(run_node(&plan.nodes[index], record, &done, shown, run.store));
     }
+    let numbers = [&done[..], &undone].concat();
     let unfinished = undone
         .iter()
-        .map(|&index| unfinished_node(plan, index, &done, &undone, progress))
+        .map(|&index| unfinished_node(&plan.nodes[index], index, &numbers, progress))
         .collect();
     let mut failed = Vec::with_capacity(missing.len());
     for ShownPoint { node, point, values } in missing {
@@ -81,13 +76,14 @@ pub(crate) fn run_record(
         .ok()
         .filter(|folder| folder.to_str().is_some())
         .unwrap_or_default();
-    let data_sets = data_sets(plan, sink);
-    Some(RunRecord { pages_folder, command: Vec::new(), data_sets, nodes, failed, unfinished })
+    let data_sets = data_sets(plan, sink.nodes());
+    let command = Vec::new();
+    Some((RunRecord { pages_folder, command, data_sets, nodes, failed, unfinished }, done))
 }
 
-/// Returns the nodes that a sink shows and their ancestors, in the plan's order.
-fn nodes_with_ancestors(plan: &Plan, sink: &Sink) -> BTreeSet<usize> {
-    let mut found = sink.nodes();
+/// Returns nodes and their ancestors, in the plan's order.
+fn with_ancestors(plan: &Plan, nodes: BTreeSet<usize>) -> BTreeSet<usize> {
+    let mut found = nodes;
     for index in (0..plan.nodes.len()).rev() {
         if found.contains(&index) {
             found.extend(plan.nodes[index].parents());
@@ -147,16 +143,14 @@ fn run_node(
     }
 }
 
+/// Returns the record of an unfinished node. `numbers` are the indices of all nodes in a record:
+/// done ones first.
 fn unfinished_node(
-    plan: &Plan,
+    node: &Node,
     index: usize,
-    done: &[usize],
-    undone: &[usize],
-    progress: &RunProgress<'_>,
+    numbers: &[usize],
+    progress: &RunProgress,
 ) -> UnfinishedNode {
-    let node = &plan.nodes[index];
-    // Numbers of a record's nodes: done ones first.
-    let numbers: Vec<usize> = done.iter().chain(undone).copied().collect();
     let failure = progress.failures.iter().find(|(failed, _)| *failed == index);
     UnfinishedNode {
         stage: node.stage.clone(),
@@ -171,68 +165,48 @@ fn unfinished_node(
     }
 }
 
-/// Returns the data sets from which the shown nodes were computed: folders, and blocks that create
-/// data sets.
-fn data_sets(plan: &Plan, sink: &Sink) -> Vec<String> {
+/// Returns the data sets from which nodes are computed: folders, and blocks that create data sets.
+fn data_sets(plan: &Plan, nodes: BTreeSet<usize>) -> Vec<String> {
     let mut found = BTreeSet::new();
-    for node in nodes_with_ancestors(plan, sink).into_iter().map(|index| &plan.nodes[index]) {
-        let folders: Vec<String> = node
-            .inputs
-            .iter()
-            .filter_map(|input| match &input.from {
-                Origin::Folder(folder) => Some(folder.display().to_string()),
-                Origin::Node { .. } => None,
-            })
-            .collect();
-        add_data_sets(&mut found, &node.stage, &node.program.description.output.kind, folders);
+    for node in with_ancestors(plan, nodes).into_iter().map(|index| &plan.nodes[index]) {
+        let folders = node.inputs.iter().filter_map(|input| match &input.from {
+            Origin::Folder(folder) => Some(folder.display().to_string()),
+            Origin::Node { .. } => None,
+        });
+        let folders: Vec<String> = folders.collect();
+        match node.program.description.output.kind.as_str() {
+            "dataset" if folders.is_empty() => _ = found.insert(node.stage.clone()),
+            "dataset" | "scene" => found.extend(folders),
+            _ => {}
+        }
     }
     found.into_iter().collect()
 }
 
-/// Adds the data sets that a stage reads from folders, or that it creates itself.
-fn add_data_sets(found: &mut BTreeSet<String>, stage: &str, kind: &str, folders: Vec<String>) {
-    match kind {
-        "dataset" if folders.is_empty() => _ = found.insert(stage.to_owned()),
-        "dataset" | "scene" => found.extend(folders),
-        _ => {}
-    }
-}
-
-/// Returns the shown results, each as its data sets, stage and point.
-pub(crate) fn shown_results(record: &RunRecord) -> BTreeSet<String> {
-    let mut results = BTreeSet::new();
-    for (index, node) in record.nodes.iter().enumerate().filter(|(_, node)| node.is_shown) {
-        let mut data_sets = BTreeSet::new();
-        for ancestor in record.ancestors(index).into_iter().map(|index| &record.nodes[index]) {
-            let folders = ancestor.inputs.values().filter_map(|input| input.folder.as_ref());
-            let folders: Vec<String> = folders.map(|folder| folder.display().to_string()).collect();
-            add_data_sets(&mut data_sets, &ancestor.stage, &ancestor.kind, folders);
-        }
-        let data_sets = data_sets.into_iter().collect::<Vec<_>>().join(", ");
-        results.insert(format!("{data_sets}: {}", artifact::label(&node.stage, &node.point)));
-    }
-    results
+/// Returns the shown results, each as its data sets, stage and point. `nodes` are the
+/// indices of the recorded nodes in the plan.
+pub(crate) fn shown_results(record: &RunRecord, plan: &Plan, nodes: &[usize]) -> BTreeSet<String> {
+    let shown = record.nodes.iter().zip(nodes).filter(|(node, _)| node.is_shown);
+    let results = shown.map(|(node, index)| {
+        let data_sets = data_sets(plan, BTreeSet::from([*index])).join(", ");
+        format!("{data_sets}: {}", artifact::label(&node.stage, &node.point))
+    });
+    results.collect()
 }
 
 /// Adds the values that the scene decides, read from the artifacts, and this run's own data.
+/// `indices` are those of the recorded nodes.
 pub(crate) fn add_details(
     record: &mut RunRecord,
     plan: &Plan,
-    sink: &Sink,
-    progress: &RunProgress<'_>,
+    indices: &[usize],
+    progress: &RunProgress,
 ) {
-    for node in &mut record.nodes {
-        let mut shown = sink.points.iter().filter(|shown| shown.point == node.point);
-        let shown = shown.find(|shown| plan.nodes[shown.node].stage == node.stage);
-        let index = shown.map(|shown| shown.node).or_else(|| {
-            let mut planned = plan.nodes.iter();
-            planned.position(|planned| planned.stage == node.stage && planned.point == node.point)
-        });
-        let Some(index) = index else { continue };
-        node.resolved = plan.nodes[index].scene_defaults(&node.folder);
-        node.is_cached = progress.ran.map(|ran| !ran.contains(&index));
+    for (node, index) in record.nodes.iter_mut().zip(indices) {
+        node.resolved = plan.nodes[*index].scene_defaults(&node.folder);
+        node.is_cached = progress.ran.as_ref().map(|ran| !ran.contains(index));
     }
-    record.command = progress.command.to_vec();
+    record.command = progress.command.clone();
 }
 
 #[cfg(test)]

@@ -1,17 +1,18 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, report_text};
-use planning::{Describing, Devices, Origin, Pipeline, Plan, PlanError, Request, State};
+use artifact::{Failure, hash_json, report_text};
+use planning::{
+    Describing, Devices, Origin, Pipeline, Plan, PlanError, Request, State, read_source,
+};
 use slurm::{Job, Queue, Slurm};
 use stage::check_device;
 use store::{RunFile, Store};
 
 use crate::estimates::Estimates;
-use crate::identities::node_identities;
-use crate::stage_inputs;
+use crate::planned::Planned;
 
 /// Pipeline, store and devices of a verb.
 pub(crate) struct Session {
@@ -51,10 +52,10 @@ impl Session {
     }
 
     /// Creates a plan as [`Self::plan`] does, and finds the states of its nodes.
-    pub(crate) fn plan_with_states(&self, request: &Request) -> anyhow::Result<(Plan, Vec<State>)> {
+    pub(crate) fn plan_with_states(&self, request: &Request) -> anyhow::Result<Planned<'_>> {
         let plan = self.plan(request)?;
         let states = plan.states(&self.store, None)?;
-        Ok((plan, states))
+        Ok(Planned { store: &self.store, plan, states })
     }
 
     /// Creates a plan. `describing` states which programs may be started to describe themselves.
@@ -65,9 +66,11 @@ impl Session {
     ) -> anyhow::Result<Plan> {
         let (pipeline, targets) = planning::find_targets(&self.pipeline, &request.targets)?;
         let request = Request { targets, ..request.clone() };
-        let request = stage_inputs::with_folders(&pipeline, self, &request, describing)?;
-        let plan = Plan::new(&pipeline, &self.store, &request, describing)?;
-        let plan = Plan { devices: self.devices.clone(), ..plan };
+        let plan_of = |request: &Request| {
+            let plan = Plan::new(&pipeline, &self.store, request, describing)?;
+            Ok(Plan { devices: self.devices.clone(), ..plan })
+        };
+        let plan = plan_of(&with_artifact_folders(&pipeline, &self.store, &request, plan_of)?)?;
         check_not_in_input(&plan, "the store", self.store.root())?;
         for note in &plan.notes {
             report_text(note);
@@ -77,18 +80,19 @@ impl Session {
 
     /// Finds the queued or running job of each node, and the number of this store's other jobs.
     /// Slurm is called once, and only if this store has submissions.
-    pub(crate) fn jobs(&self, plan: &Plan) -> (Vec<Option<Job>>, usize) {
+    pub(crate) fn jobs(&self, plan: &Plan) -> (BTreeMap<usize, Job>, usize) {
         let queue = Queue::read(&Slurm::default(), self.store.root()).unwrap_or_else(|error| {
             report_text(&format!("nerf-sr: cannot read the queue of jobs: {error}"));
             Queue::default()
         });
         if queue.jobs.is_empty() {
-            return (Vec::new(), 0);
+            return (BTreeMap::new(), 0);
         }
         let identities = node_identities(plan, &self.store, None).unwrap_or_default();
-        let jobs: Vec<Option<Job>> =
-            identities.iter().map(|identity| queue.find_job(identity).cloned()).collect();
-        let others = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
+        let jobs = identities.iter().map(|identity| queue.find_job(identity).cloned()).enumerate();
+        let jobs: BTreeMap<usize, Job> =
+            jobs.filter_map(|(index, job)| Some((index, job?))).collect();
+        let others = queue.jobs.len().saturating_sub(jobs.len());
         (jobs, others)
     }
 }
@@ -179,4 +183,104 @@ pub(crate) fn nodes_of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, Pla
     let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
     let known = artifact::known_names(stage, known);
     Err(PlanError::Usage(format!("no stage {stage:?} in this plan; {known}")))
+}
+
+/// Computes identities of nodes whose keys may not be known yet: hashes of the key's parts, with
+/// parents' identities instead of their outputs (docs/design/032). Fails soon after `stop` is set.
+pub(crate) fn node_identities(
+    plan: &Plan,
+    store: &Store,
+    stop: Option<&AtomicBool>,
+) -> Result<Vec<String>, PlanError> {
+    let mut identities: Vec<String> = Vec::with_capacity(plan.nodes.len());
+    for node in &plan.nodes {
+        let mut inputs = Vec::new();
+        for input in &node.inputs {
+            let content = match &input.from {
+                Origin::Node { index, subtree } => {
+                    format!("{}/{}", identities[*index], subtree.as_deref().unwrap_or_default())
+                }
+                Origin::Folder(folder) => {
+                    read_source(store, node, &input.name, folder, stop)?.content_hash()
+                }
+            };
+            inputs.push((input.name.clone(), content));
+        }
+        identities.push(hash_json(&planning::key_parts(node, &inputs, plan.device(&node.stage))));
+    }
+    Ok(identities)
+}
+
+/// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts: `-i init=train-ss`
+/// is the artifact that `train-ss` has without this argument. An existing file of that name has
+/// priority. The artifact is that of the same command line, without the argument and without the
+/// stage's own parameters, which are those of the training that continues. Only the stages' names
+/// in earlier arguments have been replaced in that command line. `new_plan` creates a plan of the
+/// pipeline.
+fn with_artifact_folders(
+    pipeline: &Pipeline,
+    store: &Store,
+    request: &Request,
+    new_plan: impl Fn(&Request) -> Result<Plan, PlanError>,
+) -> Result<Request, PlanError> {
+    let mut resolved = request.clone();
+    for (index, input) in request.inputs.iter().enumerate() {
+        let Some((name, stage)) = input.split_once('=') else { continue };
+        if !pipeline.stages.contains_key(stage) || Path::new(stage).exists() {
+            continue;
+        }
+        let mut earlier = Request { targets: vec![stage.to_owned()], ..resolved.clone() };
+        earlier.inputs.remove(index);
+        let plan = new_plan(&Request { parameters: Vec::new(), ..earlier.clone() })?;
+        let names = plan.nodes[nodes_of_stage(&plan, stage)?[0]].program.schema.names();
+        earlier.parameters.retain(|text| !is_of_stage(text, stage, &names));
+        let folder = artifact_folder(store, &new_plan(&earlier)?, stage, input)?;
+        resolved.inputs[index] = format!("{name}={folder}");
+    }
+    Ok(resolved)
+}
+
+/// Returns the folder of a stage's artifact, for the argument `input`.
+fn artifact_folder(
+    store: &Store,
+    plan: &Plan,
+    stage: &str,
+    input: &str,
+) -> Result<String, PlanError> {
+    let states = plan.states(store, None)?;
+    let mut found = plan.nodes.iter().zip(states).filter(|(node, _)| node.stage == stage);
+    let problem = match (found.next(), found.next()) {
+        (Some((_, State::Cached(record))), None) => {
+            return Ok(store.object(&record.output).display().to_string());
+        }
+        (Some(_), None) => format!("has no artifact yet; run it first: nerf-sr run {stage}"),
+        _ => "has several points; name the folder of one (`nerf-sr path`)".to_owned(),
+    };
+    Err(PlanError::Usage(format!("-i {input}: {stage} {problem}")))
+}
+
+/// True if an argument of `-p` sets a parameter of the stage.
+fn is_of_stage(text: &str, stage: &str, names: &[&str]) -> bool {
+    let name = text.split('=').next().unwrap_or_default();
+    name.strip_prefix(stage).is_some_and(|rest| rest.starts_with('.')) || names.contains(&name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arguments_are_matched_to_their_stage() {
+        let names = ["rays", "seed"];
+        for (text, expected) in [
+            ("rays=30M", true),
+            ("train-ss.rays=1,2", true),
+            ("prep.scale=3", false),
+            ("scale=3", false),
+            ("train-ss-2.rays=1", false),
+            ("", false),
+        ] {
+            assert_eq!(is_of_stage(text, "train-ss", &names), expected, "{text}");
+        }
+    }
 }

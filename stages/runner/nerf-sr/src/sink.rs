@@ -2,7 +2,7 @@
 //! cached, but a sink whose page shows the same record already isn't called again.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use artifact::{
     MANIFEST_FILE, Manifest, RunRecord, format_count, format_size, hash_json, list_output_files,
@@ -11,14 +11,13 @@ use artifact::{
 use planning::stage_call::{Call, Display, StageFailure};
 use planning::{Sink, environment_parts};
 use serde_json::{Map, Value, json};
-use store::{Record, StoreError};
+use store::StoreError;
 
-use crate::failure;
 use crate::page::PageMark;
 use crate::publish::{has_current_page, publish};
 use crate::run_record::{RunProgress, add_details, run_record, shown_results};
 use crate::session::Run;
-use crate::unchanged::ConfirmedProgram;
+use crate::unchanged::call_confirmed;
 
 /// Returns the identity of a sink's page: a hash of the record, the sink's code, parameters and
 /// environment variables. Values that the scene decides follow from these, so they aren't hashed.
@@ -36,41 +35,12 @@ pub(crate) fn sink_parts(sink: &Sink) -> Map<String, Value> {
     parts
 }
 
-/// True if a sink's page already shows these records.
-pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, records: &[Option<Record>]) -> bool {
-    let record = run_record(run, sink, &RunProgress::not_started(records));
-    record.is_some_and(|record| {
+/// True if a sink's page already shows the run's records.
+pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, progress: &RunProgress) -> bool {
+    let record = run_record(run, sink, progress);
+    record.is_some_and(|(record, _)| {
         has_current_page(&run.out.join(&sink.stage), &page_identity(sink, &record))
     })
-}
-
-/// Result of [`run_sink`].
-pub(crate) enum SinkResult {
-    /// The sink wrote its folder. `archived` are the new paths of earlier pages.
-    Written { folder: PathBuf, archived: Vec<PathBuf> },
-    /// The folder already shows this record.
-    UpToDate(PathBuf),
-    /// A node that the sink shows has no record.
-    Incomplete,
-}
-
-impl SinkResult {
-    /// Prints the path of the sink's page, and the new paths of earlier pages.
-    pub(crate) fn print(&self, stage: &str) {
-        match self {
-            Self::Written { folder, archived } => {
-                for folder in archived {
-                    print_line!("{stage}: moved the earlier page to {}", page_path(folder));
-                }
-                print_line!("{stage}: {}", page_path(folder));
-                for entry in listing(folder) {
-                    print_line!("{stage}: {entry}");
-                }
-            }
-            Self::UpToDate(folder) => print_line!("{stage}: {} (up to date)", page_path(folder)),
-            Self::Incomplete => print_line!("{stage}: nothing to show"),
-        }
-    }
 }
 
 /// Returns the path of the page in a sink's folder, or the folder if it has no page.
@@ -104,29 +74,36 @@ fn listing(folder: &Path) -> Vec<String> {
     lines.collect()
 }
 
-/// Calls a sink and publishes its page as `out/STAGE`.
+/// Calls a sink, publishes its page as `out/STAGE`, and prints its path and the new paths of
+/// earlier pages. Returns whether a page was written: not if a node that the sink shows has no
+/// record, or if the folder already shows this record.
 pub(crate) fn run_sink(
     run: &Run<'_>,
     sink: &Sink,
     threads: usize,
-    progress: &RunProgress<'_>,
-) -> Result<SinkResult, StageFailure> {
-    let Some(mut record) = run_record(run, sink, progress) else {
-        return Ok(SinkResult::Incomplete);
+    progress: &RunProgress,
+) -> anyhow::Result<bool> {
+    let Some((mut record, indices)) = run_record(run, sink, progress) else {
+        print_line!("{}: nothing to show", sink.stage);
+        return Ok(false);
     };
-    let target = run.out.join(&sink.stage);
+    let stage = &sink.stage;
+    let target = run.out.join(stage);
     let identity = page_identity(sink, &record);
     if has_current_page(&target, &identity) {
-        return Ok(SinkResult::UpToDate(target));
+        print_line!("{stage}: {} (up to date)", page_path(&target));
+        return Ok(false);
     }
-    add_details(&mut record, run.plan, sink, progress);
-    let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
+    add_details(&mut record, run.plan, &indices, progress);
+    let scratch = run.store.scratch(run.file.id()).join(stage);
     let output = scratch.join("output");
-    call(run, sink, threads, &record, &scratch, &output)?;
+    call_confirmed(&sink.program, run.store, run.stop, || {
+        call(run, sink, threads, &record, &scratch, &output)
+    })?;
     if output.symlink_metadata().is_err() {
-        return Err(failure(StoreError::missing_output()));
+        return Err(StoreError::missing_output().into());
     }
-    list_output_files(&output).map_err(failure)?;
+    list_output_files(&output)?;
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
     if !manifest.exists() {
@@ -134,13 +111,20 @@ pub(crate) fn run_sink(
             Manifest::of_folder(kind, &output).map_err(|e| StageFailure::at(&output, &e))?;
         write_json(&manifest, &found).map_err(|e| StageFailure::at(&manifest, &e))?;
     }
-    let mark =
-        PageMark { identity, results: Some(shown_results(&record)), data_sets: record.data_sets };
+    let results = Some(shown_results(&record, run.plan, &indices));
+    let mark = PageMark { identity, results, data_sets: record.data_sets };
     mark.write(&output).map_err(|e| StageFailure::at(&output, &e))?;
     let archived = publish(&output, &target, kind, run.stop)?;
     // Leftovers of a sink have no value.
     std::fs::remove_dir_all(&scratch).ok();
-    Ok(SinkResult::Written { folder: target, archived })
+    for folder in archived {
+        print_line!("{stage}: moved the earlier page to {}", page_path(&folder));
+    }
+    print_line!("{stage}: {}", page_path(&target));
+    for entry in listing(&target) {
+        print_line!("{stage}: {entry}");
+    }
+    Ok(true)
 }
 
 /// Calls a sink's program, which reads `run.json` and writes `output`.
@@ -151,14 +135,13 @@ fn call(
     record: &RunRecord,
     scratch: &Path,
     output: &Path,
-) -> Result<(), StageFailure> {
+) -> anyhow::Result<()> {
     let folder = scratch.join("run");
     let params = scratch.join("params.json");
     std::fs::create_dir_all(&folder)
         .and_then(|()| write_json(&folder.join("run.json"), record))
         .and_then(|()| write_json(&params, &sink.parameters))
         .map_err(|e| StageFailure::at(scratch, &e))?;
-    let program = ConfirmedProgram::new(&sink.program, run.store, run.stop)?;
     let display = Display::default();
     let view = display.start(&sink.stage);
     let call = Call {
@@ -178,7 +161,7 @@ fn call(
     let (_, result) = call.run(&scratch.join("log"), &view, run.stop);
     view.end();
     result?;
-    program.confirm_again()
+    Ok(())
 }
 
 #[cfg(test)]

@@ -3,57 +3,27 @@
 //! checks.
 
 use std::collections::BTreeMap;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{Damage, MANIFEST_FILE, Manifest, write_atomically};
-use planning::stage_call::StageFailure;
+use artifact::{Damage, Failure, MANIFEST_FILE, Manifest, write_atomically};
 use planning::{
-    HashedInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp, read_source,
+    HashedInputs, Node, NodeInput, Origin, Source, StageProgram, Stamp, read_source,
 };
 use store::{Attempt, Store};
 
-use crate::{failure, plan_exit_code};
-
-/// A program that was confirmed before its start.
-pub(crate) struct ConfirmedProgram<'a> {
-    program: &'a StageProgram,
-    store: &'a Store,
-    stamp: Stamp,
-}
-
-impl<'a> ConfirmedProgram<'a> {
-    /// Confirms that a program is the planned one.
-    pub(crate) fn new(
-        program: &'a StageProgram,
-        store: &'a Store,
-        stop: &AtomicBool,
-    ) -> Result<Self, StageFailure> {
-        let stamp = program.confirm(store, Some(stop)).map_err(|e| confirmation_failure(&e))?;
-        Ok(Self { program, store, stamp })
-    }
-
-    /// Confirms after the program's end that the program was not changed since [`Self::new`]. Only
-    /// a second signal interrupts this: the first one must not cost a result.
-    pub(crate) fn confirm_again(&self) -> Result<(), StageFailure> {
-        let confirmed = self.program.confirm_since(&self.stamp, self.store, None);
-        confirmed.map_err(|e| confirmation_failure(&e))
-    }
-}
-
-fn confirmation_failure(problem: &PlanError) -> StageFailure {
-    StageFailure { code: plan_exit_code(problem), message: problem.to_string() }
-}
-
-/// Returns the failure of a stage whose inputs can't be used.
-pub(crate) fn input_failure(problem: &PlanError) -> StageFailure {
-    let code = match problem {
-        PlanError::Source { .. } | PlanError::Artifact(_) => StageFailure::BAD_INPUT,
-        PlanError::Interrupted => StageFailure::INTERRUPTED,
-        PlanError::Pipeline(_) | PlanError::Store(_) | PlanError::Usage(_) => StageFailure::FAILED,
-    };
-    StageFailure { code, message: problem.to_string() }
+/// Calls a program if it is the planned one, and fails if it was changed until its end. Only a
+/// second signal interrupts the latter check: the first one must not cost a result.
+pub(crate) fn call_confirmed<T>(
+    program: &StageProgram,
+    store: &Store,
+    stop: &AtomicBool,
+    call: impl FnOnce() -> anyhow::Result<T>,
+) -> anyhow::Result<T> {
+    let start = program.confirm(store, Some(stop))?;
+    let result = call()?;
+    program.confirm_since(&start, store, None)?;
+    Ok(result)
 }
 
 /// Inputs of a node, as they were when the key was computed.
@@ -74,7 +44,7 @@ impl<'a> Inputs<'a> {
         store: &'a Store,
         found: HashedInputs,
         output_of: impl Fn(usize) -> String,
-    ) -> Result<Self, StageFailure> {
+    ) -> Result<Self, Failure> {
         let mut artifacts = Vec::new();
         for input in &node.inputs {
             if let Origin::Node { index, subtree } = &input.from {
@@ -87,46 +57,46 @@ impl<'a> Inputs<'a> {
         if !node.program.is_own() {
             // The runner's own programs compare files with manifests themselves.
             for artifact in &inputs.artifacts {
-                artifact.check_contents().map_err(|e| damage_failure(&e))?;
+                let checked = artifact.manifest.check_contents(&artifact.folder);
+                checked.map_err(|e| damage_failure(&e))?;
             }
         }
         Ok(inputs)
     }
 
     /// Fails if an input was changed since its content was hashed.
-    pub(crate) fn check(&self, stop: &AtomicBool) -> Result<(), StageFailure> {
-        self.find_change(Some(stop))?.map_or(Ok(()), Err)
+    pub(crate) fn check(&self, stop: &AtomicBool) -> anyhow::Result<()> {
+        Ok(self.find_change(Some(stop))?.map_or(Ok(()), Err)?)
     }
 
     /// Checks the inputs like [`Self::check`] after the stage's end. If an input was changed,
     /// removes the attempt's checkpoints: they may contain the changed input, even if it gets its
     /// old content back. Only a second signal interrupts this: the first one must not cost a
     /// result.
-    pub(crate) fn check_again(&self, attempt: &Attempt) -> Result<(), StageFailure> {
+    pub(crate) fn check_again(&self, attempt: &Attempt) -> anyhow::Result<()> {
         let Some(change) = self.find_change(None)? else { return Ok(()) };
-        attempt.remove_checkpoints().map_err(failure)?;
-        Err(change)
+        attempt.remove_checkpoints()?;
+        Err(change.into())
     }
 
     /// Returns the failure for an input that was changed since its content was hashed. Fails if an
     /// input can't be compared: an unreadable one may be unchanged.
-    fn find_change(&self, stop: Option<&AtomicBool>) -> Result<Option<StageFailure>, StageFailure> {
+    fn find_change(&self, stop: Option<&AtomicBool>) -> anyhow::Result<Option<Failure>> {
         for NodeInput { name, from } in &self.node.inputs {
             let Origin::Folder(folder) = from else { continue };
-            let now = read_source(self.store, self.node, name, folder, stop)
-                .map_err(|e| input_failure(&e))?;
+            let now = read_source(self.store, self.node, name, folder, stop)?;
             if let Some(change) = now.change_since(&self.sources[name]) {
-                let message = format!(
+                let problem = format!(
                     "input {name} ({}): {change} since it was hashed, so no result is recorded; \
                     run again",
                     folder.display()
                 );
-                return Ok(Some(StageFailure { code: StageFailure::BAD_INPUT, message }));
+                return Ok(Some(Failure::BadInput(problem)));
             }
         }
         match self.artifacts.iter().try_for_each(StoredInput::check) {
             Ok(()) => Ok(None),
-            Err(unreadable @ Damage::Unreadable { .. }) => Err(damage_failure(&unreadable)),
+            Err(unreadable @ Damage::Unreadable { .. }) => Err(damage_failure(&unreadable).into()),
             Err(damage) => Ok(Some(damage_failure(&damage))),
         }
     }
@@ -134,7 +104,7 @@ impl<'a> Inputs<'a> {
     /// Removes checkpoints of an earlier attempt if a folder outside the store was written to since
     /// that attempt began: the content is the same now, but the attempt may have read other
     /// content. Returns whether checkpoints were removed.
-    pub(crate) fn drop_doubtful_checkpoints(&self, attempt: &Attempt) -> io::Result<bool> {
+    pub(crate) fn drop_doubtful_checkpoints(&self, attempt: &Attempt) -> anyhow::Result<bool> {
         let sources = self.sources.iter();
         let times: BTreeMap<String, String> =
             sources.map(|(name, source)| (name.clone(), source.times_hash())).collect();
@@ -149,15 +119,15 @@ impl<'a> Inputs<'a> {
         }
         let is_doubtful = earlier.is_some() && attempt.work.exists();
         if is_doubtful {
-            attempt.remove_checkpoints().map_err(io::Error::other)?;
+            attempt.remove_checkpoints()?;
         }
         write_atomically(&file, serde_json::to_string(&times)?.as_bytes())?;
         Ok(is_doubtful)
     }
 }
 
-fn damage_failure(damage: &Damage) -> StageFailure {
-    StageFailure { code: StageFailure::BAD_INPUT, message: damage.to_string() }
+fn damage_failure(damage: &Damage) -> Failure {
+    Failure::BadInput(damage.to_string())
 }
 
 /// An input from the store.
@@ -187,21 +157,15 @@ impl StoredInput {
         let now = stamps(&self.folder, &self.manifest)?;
         let is_untouched =
             now.iter().enumerate().all(|(i, stamp)| stamp.is_untouched_since(&self.stamps[i]));
-        if is_untouched { Ok(()) } else { self.check_contents() }
-    }
-
-    fn check_contents(&self) -> Result<(), Damage> {
-        self.manifest.check_contents(&self.folder)
+        if is_untouched { Ok(()) } else { self.manifest.check_contents(&self.folder) }
     }
 }
 
 fn stamps(folder: &Path, manifest: &Manifest) -> Result<Vec<Stamp>, Damage> {
-    let mut stamps = Vec::with_capacity(manifest.files.len());
-    for file in &manifest.files {
-        let path = folder.join(&file.path);
-        stamps.push(Stamp::of(&path).map_err(|source| Damage::Unreadable { path, source })?);
-    }
-    Ok(stamps)
+    let paths = manifest.files.iter().map(|file| folder.join(&file.path));
+    paths
+        .map(|path| Stamp::of(&path).map_err(|source| Damage::Unreadable { path, source }))
+        .collect()
 }
 
 #[cfg(test)]
@@ -247,11 +211,11 @@ mod tests {
         let before = inputs(&node, &store);
         before.check_again(&attempt).unwrap();
         fs::rename(&data, &away).unwrap();
-        let message = before.check_again(&attempt).unwrap_err().message;
+        let message = before.check_again(&attempt).unwrap_err().to_string();
         assert!(message.contains("no such folder") && attempt.work.exists(), "{message}");
         fs::rename(&away, &data).unwrap();
         fs::write(data.join("x"), "2").unwrap();
-        let message = before.check_again(&attempt).unwrap_err().message;
+        let message = before.check_again(&attempt).unwrap_err().to_string();
         assert!(message.contains("x was changed") && !attempt.work.exists(), "{message}");
     }
 

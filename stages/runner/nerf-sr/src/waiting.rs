@@ -1,13 +1,12 @@
 //! Waits for locks. Each wait reports the lock's holder and ends on a signal.
 
-use artifact::format_duration;
+use std::fs::{File, OpenOptions};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use planning::stage_call::StageFailure;
-use store::{Entered, Holder, Locked, Store, StoreError, host_name};
-
-use crate::failure;
+use artifact::{Failure, format_duration};
+use store::{Entered, Holder, Locked, Store, StoreError, host_name, is_lock_acquired};
 
 /// Interval between two attempts to lock; chosen by hand.
 const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
@@ -15,25 +14,27 @@ const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
 /// with each notice.
 const NOTICE_DELAY: Duration = Duration::from_secs(1);
 
-/// Attempts to lock until this succeeds or `stop` is set. `report` gets the holder and the time
-/// waited so far.
+/// Attempts to lock until this succeeds or `stop` is set. `report` gets a notice that begins with
+/// `cause`, and names the holder and the time waited so far.
 pub(crate) fn wait_for_lock<T>(
     stop: &AtomicBool,
-    report: &dyn Fn(Option<&Holder>, Duration),
+    cause: &str,
+    report: &dyn Fn(&str),
     mut attempt: impl FnMut() -> Result<Locked<T>, StoreError>,
-) -> Result<T, StageFailure> {
+) -> anyhow::Result<T> {
     let begin = Instant::now();
     let mut next_notice = NOTICE_DELAY;
     loop {
-        match attempt().map_err(failure)? {
+        match attempt()? {
             Locked::Acquired(held) => return Ok(held),
             Locked::HeldBy(holder) => {
                 if stop.load(Ordering::Relaxed) {
-                    let message = "interrupted while waiting for a lock".to_owned();
-                    return Err(StageFailure { code: StageFailure::INTERRUPTED, message });
+                    return Err(Failure::Interrupted.into());
                 }
                 if begin.elapsed() >= next_notice {
-                    report(holder.as_ref(), begin.elapsed());
+                    let holder = holder_text(holder.as_ref());
+                    let waited = format_duration(begin.elapsed().as_secs_f64());
+                    report(&format!("{cause}{holder}; waiting ({waited} so far)"));
                     next_notice *= 2;
                 }
                 std::thread::sleep(ATTEMPT_INTERVAL);
@@ -47,18 +48,23 @@ pub(crate) fn enter_store(
     store: &Store,
     stop: &AtomicBool,
     report: &dyn Fn(&str),
-) -> Result<Entered, StageFailure> {
-    wait_for_lock(
-        stop,
-        &|holder, waited| {
-            report(&format!(
-                "waiting for garbage collection{} ({} so far)",
-                holder_text(holder),
-                format_duration(waited.as_secs_f64())
-            ));
-        },
-        || store.try_enter(),
-    )
+) -> anyhow::Result<Entered> {
+    wait_for_lock(stop, "garbage is being collected", report, || store.try_enter())
+}
+
+/// Opens and locks a file or folder outside the store; waits while another process holds the lock.
+pub(crate) fn lock_file(
+    path: &Path,
+    options: &OpenOptions,
+    stop: &AtomicBool,
+) -> anyhow::Result<File> {
+    wait_for_lock(stop, "another run is writing", &|_| {}, || {
+        let file = options
+            .open(path)
+            .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
+        let is_acquired = is_lock_acquired(path, file.try_lock())?;
+        Ok(if is_acquired { Locked::Acquired(file) } else { Locked::HeldBy(None) })
+    })
 }
 
 /// Enters the store, or fails if garbage collection runs.
@@ -70,7 +76,7 @@ pub(crate) fn try_enter_store(store: &Store) -> anyhow::Result<Entered> {
 }
 
 /// Returns ` by process …` for a lock's holder; empty if the holder is unknown.
-pub(crate) fn holder_text(holder: Option<&Holder>) -> String {
+fn holder_text(holder: Option<&Holder>) -> String {
     let Some(Holder { pid, host, .. }) = holder else { return String::new() };
     if *host != host_name() {
         return format!(" by process {pid} on {host}");
@@ -99,13 +105,15 @@ mod tests {
         let Locked::Acquired(_lock) = store.try_lock("k").unwrap() else { panic!("held") };
         let stop = AtomicBool::new(false);
         let reports = RefCell::new(Vec::new());
-        let report = |holder: Option<&Holder>, _: Duration| {
-            reports.borrow_mut().push(holder_text(holder));
+        let report = |text: &str| {
+            reports.borrow_mut().push(text.to_owned());
             stop.store(true, Ordering::Relaxed);
         };
-        let failure = wait_for_lock(&stop, &report, || store.try_lock("k")).unwrap_err();
-        assert_eq!(failure.code, 130);
-        assert_eq!(reports.into_inner(), [format!(" by process {}", std::process::id())]);
+        let failure =
+            wait_for_lock(&stop, "is in use", &report, || store.try_lock("k")).unwrap_err();
+        assert_eq!(crate::exit_code(&failure), 130);
+        let text = format!("is in use by process {}; waiting (1.0 s so far)", std::process::id());
+        assert_eq!(reports.into_inner(), [text]);
     }
 
     #[test]

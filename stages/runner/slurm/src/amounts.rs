@@ -1,15 +1,11 @@
 //! Human-readable amounts of memory and durations: `8G`, `1h30m`.
 
 use std::fmt::{self, Display, Formatter};
-use std::marker::PhantomData;
 use std::str::FromStr;
 
-use serde::de::{Deserializer, Error, Visitor};
+use serde::de::{Deserialize, Deserializer, Error, Visitor};
 
-/// Error returned when a text is not an amount.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct AmountError(String);
+use crate::SlurmError;
 
 /// An amount of memory in whole MiB: `512M`, `8G`, `1T`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -31,13 +27,6 @@ impl Memory {
     pub fn bytes(self) -> u64 {
         self.mib.saturating_mul(1 << 20)
     }
-
-    fn parse(text: &str) -> Option<Self> {
-        let (count, letter) = split_unit(text)?;
-        let (_, factor) = MEMORY_UNITS.iter().find(|(unit, _)| *unit == letter)?;
-        // Slurm reads `--mem=0` as all memory of a node.
-        count.checked_mul(*factor).filter(|&mib| mib > 0).map(|mib| Self { mib })
-    }
 }
 
 impl Period {
@@ -45,46 +34,21 @@ impl Period {
     pub(crate) fn minutes(self) -> u64 {
         self.seconds.div_ceil(60)
     }
-
-    fn parse(text: &str) -> Option<Self> {
-        let mut units = PERIOD_UNITS.iter();
-        let mut seconds = 0u64;
-        for piece in text.split_inclusive(|c: char| !c.is_ascii_digit()) {
-            let (count, letter) = split_unit(piece)?;
-            // The iterator only advances: each unit occurs at most once, larger units first.
-            let (_, factor) = units.find(|(unit, _)| *unit == letter)?;
-            seconds = seconds.checked_add(count.checked_mul(*factor)?)?;
-        }
-        (seconds > 0).then_some(Self { seconds })
-    }
 }
 
-/// Splits an amount into its number and the letter of its unit.
-fn split_unit(text: &str) -> Option<(u64, char)> {
-    let letter = text.chars().next_back()?;
-    let digits = &text[..text.len() - letter.len_utf8()];
-    // `u64::from_str` would accept a leading `+`.
-    let is_number = digits.bytes().all(|b| b.is_ascii_digit());
-    Some((digits.parse().ok().filter(|_| is_number)?, letter))
-}
-
-impl FromStr for Memory {
-    type Err = AmountError;
-
-    fn from_str(text: &str) -> Result<Self, AmountError> {
-        let remedy = "write a number with M, G or T, such as 8G";
-        Self::parse(text)
-            .ok_or_else(|| AmountError(format!("invalid amount of memory {text:?}; {remedy}")))
+/// Parses numbers with units, larger units first, to a sum; `None` for other texts and for 0, which
+/// Slurm reads as all memory of a node.
+fn parse(text: &str, units: &[(char, u64)]) -> Option<u64> {
+    let mut units = units.iter();
+    let mut sum = 0u64;
+    for piece in text.split_inclusive(|c: char| !c.is_ascii_digit()) {
+        let letter = piece.chars().next_back()?;
+        let count: u64 = piece.strip_suffix(letter)?.parse().ok()?;
+        // The iterator only advances: each unit occurs at most once.
+        let (_, factor) = units.find(|(unit, _)| *unit == letter)?;
+        sum = sum.checked_add(count.checked_mul(*factor)?)?;
     }
-}
-
-impl FromStr for Period {
-    type Err = AmountError;
-
-    fn from_str(text: &str) -> Result<Self, AmountError> {
-        let remedy = "write numbers with d, h, m or s, such as 2h or 1h30m";
-        Self::parse(text).ok_or_else(|| AmountError(format!("invalid duration {text:?}; {remedy}")))
-    }
+    (sum > 0).then_some(sum)
 }
 
 impl Display for Memory {
@@ -110,54 +74,46 @@ impl Display for Period {
     }
 }
 
-/// Reads an amount. A number without a unit fails with [`AmountError`], which asks for the unit,
-/// instead of with a type error.
-fn deserialize_amount<'de, D: Deserializer<'de>, T: FromStr<Err = AmountError>>(
-    deserializer: D,
-) -> Result<T, D::Error> {
-    struct AmountVisitor<T>(PhantomData<T>);
-    impl<T: FromStr<Err = AmountError>> Visitor<'_> for AmountVisitor<T> {
-        type Value = T;
+// Implements parsing, and serde's traits by parsing and `Display`.
+macro_rules! text_form {
+    ($type:ident { $field:ident }, $units:ident, $name:literal, $units_and_example:literal) => {
+        impl FromStr for $type {
+            type Err = SlurmError;
 
-        fn expecting(&self, f: &mut Formatter<'_>) -> fmt::Result {
-            f.write_str("a number with its unit")
+            fn from_str(text: &str) -> Result<Self, SlurmError> {
+                let $field = parse(text, &$units).ok_or_else(|| {
+                    let remedy = concat!("write a number with ", $units_and_example);
+                    SlurmError(format!("invalid {} {text:?}; {remedy}", $name))
+                })?;
+                Ok(Self { $field })
+            }
         }
-
-        fn visit_str<E: Error>(self, text: &str) -> Result<T, E> {
-            text.parse().map_err(E::custom)
-        }
-
-        fn visit_u64<E: Error>(self, number: u64) -> Result<T, E> {
-            self.visit_str(&number.to_string())
-        }
-
-        fn visit_i64<E: Error>(self, number: i64) -> Result<T, E> {
-            self.visit_str(&number.to_string())
-        }
-
-        fn visit_f64<E: Error>(self, number: f64) -> Result<T, E> {
-            self.visit_str(&number.to_string())
-        }
-    }
-    deserializer.deserialize_any(AmountVisitor(PhantomData))
-}
-
-macro_rules! serde_as_text {
-    ($type:ty) => {
         impl serde::Serialize for $type {
             fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
                 serializer.collect_str(self)
             }
         }
-        impl<'de> serde::Deserialize<'de> for $type {
+        impl<'de> Deserialize<'de> for $type {
             fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-                deserialize_amount(deserializer)
+                struct Text;
+                impl Visitor<'_> for Text {
+                    type Value = $type;
+
+                    fn expecting(&self, f: &mut Formatter<'_>) -> fmt::Result {
+                        f.write_str(concat!("a number with ", $units_and_example))
+                    }
+
+                    fn visit_str<E: Error>(self, text: &str) -> Result<$type, E> {
+                        text.parse().map_err(E::custom)
+                    }
+                }
+                deserializer.deserialize_str(Text)
             }
         }
     };
 }
-serde_as_text!(Memory);
-serde_as_text!(Period);
+text_form!(Memory { mib }, MEMORY_UNITS, "amount of memory", "M, G or T, such as 8G");
+text_form!(Period { seconds }, PERIOD_UNITS, "duration", "d, h, m or s, such as 2h or 1h30m");
 
 #[cfg(test)]
 mod tests {

@@ -13,8 +13,8 @@ const MAX_IDS_PER_CALL: usize = 500;
 /// Slurm's programs.
 #[derive(Clone, Debug, Default)]
 pub struct Slurm {
-    /// Folder of the programs in tests; `None` if they are found by PATH.
-    folder: Option<PathBuf>,
+    /// Folder of the programs in tests; empty if they are found by PATH.
+    folder: PathBuf,
 }
 
 /// Returns the ID of the job that this process runs in.
@@ -26,7 +26,7 @@ impl Slurm {
     /// Returns the programs in a folder.
     #[cfg(test)]
     pub(crate) fn in_folder(folder: impl Into<PathBuf>) -> Self {
-        Self { folder: Some(folder.into()) }
+        Self { folder: folder.into() }
     }
 
     /// Submits a job and returns its ID.
@@ -59,11 +59,7 @@ impl Slurm {
 
     /// Calls a program and returns its stdout.
     fn call(&self, program: &str, arguments: &[impl AsRef<OsStr>]) -> Result<String, SlurmError> {
-        let path = match &self.folder {
-            Some(folder) => folder.join(program),
-            None => PathBuf::from(program),
-        };
-        let mut command = Command::new(path);
+        let mut command = Command::new(self.folder.join(program));
         // A user's defaults for `squeue`, such as a state filter, would hide jobs.
         for (name, _) in std::env::vars_os() {
             if name.as_encoded_bytes().starts_with(b"SQUEUE_") {

@@ -26,26 +26,24 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod amounts;
-mod arguments;
 mod commands;
 mod queue;
 mod resources;
-mod script;
 mod site;
 mod submission;
 mod submit;
 
 use std::path::Path;
 
-pub use amounts::{AmountError, Memory, Period};
+pub use amounts::{Memory, Period};
 pub use commands::{Slurm, current_job_id};
 pub use queue::{Job, Queue};
 pub use resources::Resources;
 pub use site::Site;
-pub use submission::{Submission, Task, list_submissions, newest_logs};
+pub use submission::{Submission, Task, list_submissions, lock_path, newest_logs};
 pub use submit::{SubmitOptions, Submitted};
 
-/// Error of a call of Slurm, or of a file of a submission or site.
+/// Error of a call of Slurm, of a file of a submission or site, or of an amount's text.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct SlurmError(String);

@@ -71,7 +71,7 @@ mod tests {
             ("mem: 8", "mem: invalid amount of memory \"8\""),
             ("time: 90", "time: invalid duration \"90\""),
             ("time: 1.5", "time: invalid duration \"1.5\""),
-            ("time: [2h]", "a number with its unit"),
+            ("time: [2h]", "expected a number with d, h, m or s, such as 2h"),
             ("cpus: 0", "cpus: invalid value: integer `0`"),
             ("gpus: -1", "gpus: invalid type: integer `-1`"),
             ("cores: 4", "unknown field `cores`, expected one of `cpus`, `mem`, `gpus`, `time`"),

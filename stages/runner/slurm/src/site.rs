@@ -48,15 +48,10 @@ const MAX_NOTICE_SECONDS: u64 = 65_535;
 impl Site {
     /// Reads a site file. Without one, reads `~/.config/nerf-sr/slurm.yaml` if that file exists.
     pub fn find(file: Option<&Path>) -> Result<Self, SlurmError> {
-        if let Some(file) = file {
-            return Self::read(file);
-        }
         let default = std::env::var_os("HOME")
-            .map(|home| PathBuf::from(home).join(".config/nerf-sr/slurm.yaml"));
-        match default.filter(|file| file.exists()) {
-            Some(file) => Self::read(&file),
-            None => Ok(Self::default()),
-        }
+            .map(|home| PathBuf::from(home).join(".config/nerf-sr/slurm.yaml"))
+            .filter(|file| file.exists());
+        file.or(default.as_deref()).map_or_else(|| Ok(Self::default()), Self::read)
     }
 
     /// Returns why jobs with these resources could never make progress; `None` if they can.

@@ -1,16 +1,15 @@
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
-use std::fs::{self, File, TryLockError};
+use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use crate::SlurmError;
 use crate::resources::Resources;
-use crate::script::script;
 use crate::site::Site;
+use crate::submit::SubmitOptions;
 
 /// A task for a job.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -49,9 +48,6 @@ pub struct Submission {
 const TASKS: &str = "tasks.json";
 const SCRIPT: &str = "job.sh";
 
-/// Interval between two attempts to lock.
-const ATTEMPT_INTERVAL: Duration = Duration::from_millis(50);
-
 impl Submission {
     /// Creates a submission in memory; [`Self::submit`] writes its folder.
     pub fn new(root: &Path, id: &str, tasks: Vec<Task>) -> Self {
@@ -79,16 +75,12 @@ impl Submission {
         self.folder.join(SCRIPT)
     }
 
-    /// Writes the folder, whole or not at all. The script calls `command` with the folder and a
-    /// task's number.
-    pub(crate) fn write(
-        &self,
-        plan: &[u8],
-        site: &Site,
-        command: &[&OsStr],
-    ) -> Result<(), SlurmError> {
+    /// Writes the folder, whole or not at all. The script calls the command with the folder and
+    /// a task's number.
+    pub(crate) fn write(&self, options: &SubmitOptions<'_>) -> Result<(), SlurmError> {
+        let SubmitOptions { plan, site, command, .. } = options;
         let partial = self.folder.with_file_name(format!(".{}.new", self.id));
-        let command = [command, &[self.folder.as_os_str()]].concat();
+        let command = [*command, &[self.folder.as_os_str()]].concat();
         let tasks =
             serde_json::to_vec(&self.tasks).map_err(|e| SlurmError::file(&self.folder, e))?;
         fs::create_dir_all(&partial)
@@ -139,30 +131,41 @@ pub fn newest_logs(root: &Path) -> Result<BTreeMap<String, PathBuf>, SlurmError>
     Ok(logs)
 }
 
-/// Locks a store's submissions, so that two processes don't submit the same task. `None` if
-/// `is_stopped` became true first.
-pub(crate) fn lock_submissions(
-    root: &Path,
-    is_stopped: &dyn Fn() -> bool,
-) -> Result<Option<File>, SlurmError> {
-    let folder = root.join("slurm");
-    let path = folder.join("lock");
-    let file = fs::create_dir_all(&folder)
-        .and_then(|()| File::options().create(true).append(true).open(&path))
-        .map_err(|e| SlurmError::file(&path, e))?;
-    loop {
-        match file.try_lock() {
-            Ok(()) => return Ok(Some(file)),
-            Err(TryLockError::WouldBlock) if is_stopped() => return Ok(None),
-            Err(TryLockError::WouldBlock) => std::thread::sleep(ATTEMPT_INTERVAL),
-            Err(TryLockError::Error(error)) => return Err(SlurmError::file(&path, error)),
-        }
+/// Returns the path of the file that a process locks while it submits, so that two processes don't
+/// submit the same task.
+pub fn lock_path(root: &Path) -> PathBuf {
+    root.join("slurm/lock")
+}
+
+/// Returns the script: the site's set-up lines, then `exec` of the command, so that Slurm's signals
+/// reach the command.
+fn script(site: &Site, command: &[&OsStr]) -> Vec<u8> {
+    let mut text =
+        b"#!/bin/bash\n# Runs one task of a submission; $1 is its index.\nset -e\n".to_vec();
+    for line in &site.setup {
+        text.extend_from_slice(line.as_bytes());
+        text.push(b'\n');
     }
+    text.extend_from_slice(b"exec");
+    for word in command {
+        text.push(b' ');
+        text.extend(shell_quoted(word.as_encoded_bytes()));
+    }
+    text.extend_from_slice(b" \"$1\"\n");
+    text
+}
+
+/// Returns a word in single quotes for a POSIX shell.
+fn shell_quoted(word: &[u8]) -> Vec<u8> {
+    let parts: Vec<&[u8]> = word.split(|&byte| byte == b'\'').collect();
+    [b"'", &parts.join(&br"'\''"[..])[..], b"'"].concat()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::commands::Slurm;
+    use std::process::Command;
 
     fn task(identity: &str) -> Task {
         Task {
@@ -177,9 +180,17 @@ mod tests {
     fn submissions_are_read_back() {
         let root = tempfile::tempdir().unwrap();
         assert!(list_submissions(root.path()).unwrap().is_empty());
+        let options = SubmitOptions {
+            slurm: &Slurm::default(),
+            site: &Site::default(),
+            command: &[OsStr::new("true")],
+            plan: b"{}",
+            working_folder: Path::new("/work"),
+            is_stopped: &|| false,
+        };
         for id in ["b", "a"] {
             let submission = Submission::new(root.path(), id, vec![task("x"), task(id)]);
-            submission.write(b"{}", &Site::default(), &[OsStr::new("true")]).unwrap();
+            submission.write(&options).unwrap();
             fs::write(submission.log_path(1), id).unwrap();
         }
         fs::create_dir(root.path().join("slurm/.c.new")).unwrap();
@@ -193,12 +204,23 @@ mod tests {
         assert!(logs["b"].ends_with("slurm/b/1.log"));
     }
 
+    /// The shell itself prints the arguments that it read.
     #[test]
-    fn only_one_process_submits_at_a_time() {
-        let root = tempfile::tempdir().unwrap();
-        let lock = lock_submissions(root.path(), &|| false).unwrap();
-        assert!(lock.is_some() && lock_submissions(root.path(), &|| true).unwrap().is_none());
-        drop(lock);
-        assert!(lock_submissions(root.path(), &|| true).unwrap().is_some());
+    fn a_shell_passes_on_equal_arguments() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("job.sh");
+        let site = Site { setup: vec!["export GREETING='good day'".to_owned()], ..Site::default() };
+        let awkward = "a b'c\"$HOME`x`\\*";
+        let print = "printf '[%s]' \"$GREETING\" \"$@\"";
+        let arguments = ["sh", "-c", print, "sh", awkward].map(OsStr::new);
+        std::fs::write(&path, script(&site, &arguments)).unwrap();
+        let output = Command::new("bash").arg(&path).arg("17").output().unwrap();
+        assert_eq!(String::from_utf8_lossy(&output.stdout), format!("[good day][{awkward}][17]"));
+        let failing = Site { setup: vec!["false".to_owned()], ..Site::default() };
+        std::fs::write(&path, script(&failing, &[OsStr::new("true")])).unwrap();
+        assert!(
+            !Command::new("bash").arg(&path).status().unwrap().success(),
+            "a set-up line that fails must end the job"
+        );
     }
 }

@@ -2,20 +2,22 @@
 
 mod training;
 
+use std::sync::OnceLock;
+use std::time::Instant;
+
+use numerics::SpeedTest;
 use serde_json::Value;
 use store::ModelCost;
 use workload::{export_bytes, export_scale, program_bytes};
 
-use super::work::{Images, Work};
+use super::work::Work;
 use training::{field_factor, training_memory, training_need, training_seconds};
 
-/// Seconds per rendered ray, of objects and of opaque scenes (docs/results/engine.md).
-const OBJECT_RENDERED_RAY_SECONDS: f64 = 4.4e-6;
-const OPAQUE_RENDERED_RAY_SECONDS: f64 = 8e-6;
-/// Fraction of the pixels that get all rays at the default tolerance, likewise; taken for any
-/// tolerance above 0.
-const OBJECT_DETAILED_PIXELS: f64 = 0.23;
-const OPAQUE_DETAILED_PIXELS: f64 = 0.29;
+/// Seconds per rendered ray, and fraction of the pixels that get all rays at the default tolerance,
+/// which is taken for any tolerance above 0: of objects and of opaque scenes
+/// (docs/results/engine.md).
+const OBJECT_RENDERING: (f64, f64) = (4.4e-6, 0.23);
+const OPAQUE_RENDERING: (f64, f64) = (8e-6, 0.29);
 /// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
 const RENDERED_BYTES_PER_FLOAT: u64 = 7;
 /// Bytes of `render-depth` without its field and libtorch, but with the rays of a band of rows; as
@@ -24,12 +26,10 @@ const RENDERER_BYTES: u64 = 28_000_000;
 /// Bytes of any other program that can contain libtorch, without it and data; as in the tests
 /// below.
 const PROGRAM_BYTES: u64 = 5_000_000;
-/// Seconds per pixel of `eval` without and with LPIPS: lego 100×2, 12 views.
-const SCORED_PIXEL_SECONDS: f64 = 1.4e-6;
-const LPIPS_PIXEL_SECONDS: f64 = 2.2e-6;
-/// Bytes per pixel of a view that `eval` scores, without and with LPIPS.
-const SCORED_PIXEL_BYTES: u64 = 125;
-const LPIPS_PIXEL_BYTES: u64 = 580;
+/// Seconds and bytes per pixel of a view that `eval` scores, without and with LPIPS: lego 100×2, 12
+/// views.
+const SCORED_PIXEL: (f64, u64) = (1.4e-6, 125);
+const LPIPS_PIXEL: (f64, u64) = (2.2e-6, 580);
 /// Seconds per photograph's pixel of `prep`.
 const PREPARED_PIXEL_SECONDS: f64 = 30e-9;
 /// Bytes of `prep` without data, and peak memory of each further thread over that of the first:
@@ -54,6 +54,12 @@ const BACKDROP_RAY_SECONDS: f64 = 0.32e-6;
 const DEMO_BYTES: u64 = 5_000_000;
 const DEMO_PIXEL_BYTES: u64 = 16;
 const CAMERA_PATH_BYTES: u64 = 5_000_000;
+
+/// Seconds of a piece of work on the reference machine: two cores with AVX-512.
+const REFERENCE_SECONDS: f64 = 0.42e-3;
+/// Number of measurements, of which the fastest counts: others may have been interrupted by other
+/// programs. All together take a hundredth of a second. Chosen by hand.
+const MEASUREMENTS: u32 = 24;
 
 /// Returns the cost of a stage on the machine of these figures; `None` for stages without a model.
 pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Option<ModelCost> {
@@ -94,15 +100,20 @@ fn libtorch_bytes(work: &Work) -> u64 {
     program_bytes(work.has_libtorch) - program_bytes(false)
 }
 
+/// Returns the bytes of a program that can contain libtorch, without data.
+fn torch_program_bytes(work: &Work) -> u64 {
+    PROGRAM_BYTES + libtorch_bytes(work)
+}
+
 /// Returns the bytes of data of the views that are processed at a time, one by each thread.
-fn concurrent_bytes(work: &Work, images: &Images, bytes_per_pixel: u64) -> u64 {
-    images.count.min(work.threads) * bytes_per_pixel * images.largest_pixels()
+fn concurrent_bytes(work: &Work, bytes_per_pixel: u64) -> u64 {
+    work.images.count.min(work.threads) * bytes_per_pixel * work.images.largest_pixels()
 }
 
 fn demo_scene(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let ray = if work.kind.is_opaque() { BACKDROP_RAY_SECONDS } else { DEMO_RAY_SECONDS };
     let pixel = DEMO_PIXEL_SECONDS + ray * number(parameters, "samples_per_axis")?.powi(2);
-    let memory = DEMO_BYTES + concurrent_bytes(work, &work.images, DEMO_PIXEL_BYTES);
+    let memory = DEMO_BYTES + concurrent_bytes(work, DEMO_PIXEL_BYTES);
     Some((work.images.pixels as f64 * pixel, memory))
 }
 
@@ -113,11 +124,7 @@ fn prep_memory(work: &Work) -> u64 {
 }
 
 fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
-    let (ray, detailed) = if work.kind.is_opaque() {
-        (OPAQUE_RENDERED_RAY_SECONDS, OPAQUE_DETAILED_PIXELS)
-    } else {
-        (OBJECT_RENDERED_RAY_SECONDS, OBJECT_DETAILED_PIXELS)
-    };
+    let (ray, detailed) = if work.kind.is_opaque() { OPAQUE_RENDERING } else { OBJECT_RENDERING };
     let field = work.field.as_ref()?;
     if field["field"] == "mlp" {
         return None;
@@ -140,13 +147,8 @@ fn rendering_memory(work: &Work) -> Option<u64> {
 }
 
 fn scoring(work: &Work) -> (f64, u64) {
-    let (seconds, bytes) = if work.computes_lpips {
-        (LPIPS_PIXEL_SECONDS, LPIPS_PIXEL_BYTES)
-    } else {
-        (SCORED_PIXEL_SECONDS, SCORED_PIXEL_BYTES)
-    };
-    let program = PROGRAM_BYTES + libtorch_bytes(work);
-    let memory = program + concurrent_bytes(work, &work.images, bytes);
+    let (seconds, bytes) = if work.computes_lpips { LPIPS_PIXEL } else { SCORED_PIXEL };
+    let memory = torch_program_bytes(work) + concurrent_bytes(work, bytes);
     (work.images.pixels as f64 * seconds, memory)
 }
 
@@ -156,15 +158,13 @@ fn refiner_training(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     }
     let patch = number(parameters, "patch_size")?.powi(2) * number(parameters, "batch_size")?;
     let seconds = number(parameters, "steps")? * patch * PATCH_PIXEL_SECONDS;
-    let program = PROGRAM_BYTES + libtorch_bytes(work);
-    Some((seconds, program + EXAMPLE_PIXEL_BYTES * work.images.pixels))
+    Some((seconds, torch_program_bytes(work) + EXAMPLE_PIXEL_BYTES * work.images.pixels))
 }
 
 fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let versions = number(parameters, "self_ensemble")?;
     let seconds = versions * work.images.pixels as f64 * REFINED_PIXEL_SECONDS;
-    let program = PROGRAM_BYTES + libtorch_bytes(work);
-    Some((seconds, program + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
+    Some((seconds, torch_program_bytes(work) + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
 }
 
 /// Returns the cost of an export: the time of its rendering, without the factor of the field's
@@ -178,21 +178,39 @@ fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let has_mesh = parameters["mesh"] == true;
     let nodes = if has_mesh { (number(parameters, "resolution")? + 1.0).powi(3) } else { 0.0 };
     let bytes = export_bytes(pixels, nodes as u64);
-    let ray = if work.kind.is_opaque() {
-        OPAQUE_RENDERED_RAY_SECONDS
-    } else {
-        OBJECT_RENDERED_RAY_SECONDS
-    };
+    let (ray, _) = if work.kind.is_opaque() { OPAQUE_RENDERING } else { OBJECT_RENDERING };
     let field = work.field.as_ref()?;
     let seconds = number(field, "ensemble")? * pixels as f64 * ray;
     Some((seconds, rendering_memory(work)? + bytes))
+}
+
+/// Returns this machine's time for the work of [`SpeedTest`] over the reference machine's time. The
+/// first call measures the machine.
+pub(crate) fn slowness() -> f64 {
+    static SLOWNESS: OnceLock<f64> = OnceLock::new();
+    *SLOWNESS.get_or_init(measure)
+}
+
+fn measure() -> f64 {
+    let mut test = SpeedTest::default();
+    let mut fastest = f64::INFINITY;
+    let mut sum = 0.0;
+    for _ in 0..MEASUREMENTS {
+        let start = Instant::now();
+        sum += test.work();
+        fastest = fastest.min(start.elapsed().as_secs_f64());
+    }
+    // The compiler must not leave the work out.
+    std::hint::black_box(sum);
+    fastest / REFERENCE_SECONDS
 }
 
 #[cfg(test)]
 mod tests {
     use serde_json::json;
 
-    use super::super::work::SceneKind;
+    use super::super::scene::SceneImages;
+    use super::super::work::{Images, SceneKind};
     use super::*;
 
     /// Returns work with square images; the field's LR width is their width.
@@ -294,13 +312,14 @@ mod tests {
             for (name, value) in changes.as_object().unwrap() {
                 parameters[name] = value.clone();
             }
-            let work = Work::of_demo(&parameters, 2).unwrap();
+            let scene = SceneImages::of_demo(&parameters, &Value::Null).unwrap();
+            let work = Work::of_demo(&scene, 2);
             let cost = model_cost("demo-scene", &parameters, &work).unwrap();
             let ratio = cost.processor_seconds / seconds;
             println!("{changes}: {:.2} s for {seconds} s", cost.processor_seconds);
             assert!((0.7..1.3).contains(&ratio), "{changes}: {ratio}");
         }
-        assert!(Work::of_demo(&json!({"size": 200}), 2).is_none());
+        assert!(SceneImages::of_demo(&json!({"size": 200}), &Value::Null).is_none());
     }
 
     /// Expected values are peak memory, in MB, from records of runs.
@@ -356,5 +375,15 @@ mod tests {
             assert_eq!(model_cost(program, &json!({}), &work), None, "no parameters");
         }
         assert_eq!(min_memory("train-ss", &json!({}), &work), None, "no parameters");
+    }
+
+    /// Machines of the last twenty years are within a factor of fifty of the reference machine,
+    /// even while other tests run.
+    #[test]
+    fn slowness_of_this_machine_is_plausible() {
+        let start = Instant::now();
+        let slowness = measure();
+        println!("{slowness:.2} in {:.3} s", start.elapsed().as_secs_f64());
+        assert!((0.02..50.0).contains(&slowness), "{slowness}");
     }
 }

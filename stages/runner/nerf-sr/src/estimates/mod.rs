@@ -1,17 +1,14 @@
 //! Estimates of the processor time and peak memory of stages (docs/design/048).
 //!
-//! * `costs`: models of the stages, from numbers of rays and pixels.
-//! * `work`, `scene`: number and size of the images, from an artifact of `prep` or from the data
-//!   set.
-//! * `path`: number and size of the frames along a `camera-path`.
-//! * `machine`: speed of this machine, by a measurement of a few milliseconds.
+//! * `costs`: models of the stages, from numbers of rays and pixels, and the speed of this machine,
+//!   by a measurement of a few milliseconds.
+//! * `work`, `scene`: number and size of the images, from an artifact of `prep`, from the data set,
+//!   or of the frames along a `camera-path`.
 //! * `text`: estimates as text, before and after a run.
 //!
 //! The nearest earlier run of the stage on this machine corrects the model's estimate.
 
 mod costs;
-mod machine;
-mod path;
 mod scene;
 mod text;
 mod work;
@@ -19,13 +16,14 @@ mod work;
 use std::collections::BTreeMap;
 
 use planning::{Node, Origin, Plan, State, nearest_record};
-use serde_json::{Map, Value, json};
+use serde_json::Value;
 use store::{ModelCost, Record, Store, host_name};
 
 pub(crate) use text::{check_memory, comparison_text, run_text, total_comparison_text};
 
-use costs::{min_memory, model_cost};
-use scene::SceneImages;
+use crate::planned::Planned;
+use costs::{min_memory, model_cost, slowness};
+use scene::{SceneImages, computed_frames, recorded_frames};
 use work::{Images, Work};
 
 /// Minimum processor seconds of an earlier run that corrects an estimate, and maximum factor
@@ -52,9 +50,9 @@ pub(crate) struct Estimate {
 /// Estimates for the nodes of a plan that aren't cached.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Estimates {
-    /// Estimates by node index; `None` for cached nodes, stages without a model, and scenes that
+    /// Estimates by node index; none for cached nodes, stages without a model, and scenes that
     /// aren't known yet.
-    nodes: Vec<Option<Estimate>>,
+    pub(crate) nodes: BTreeMap<usize, Estimate>,
     /// Number of nodes that aren't cached and have no estimate.
     pub(crate) unknown: usize,
     /// Descriptions of the plan's scenes.
@@ -63,43 +61,24 @@ pub(crate) struct Estimates {
 
 impl Estimates {
     /// Estimates the nodes of a plan.
-    pub(crate) fn new(plan: &Plan, states: &[State], store: &Store) -> Self {
+    pub(crate) fn new(planned: &Planned<'_>) -> Self {
+        let Planned { plan, states, .. } = planned;
         let is_cached = |state: &State| matches!(state, State::Cached(_));
         if states.iter().all(is_cached) {
             // A run with nothing to do reads nothing.
             return Self::default();
         }
-        let estimator = Estimator::new(plan, states, store);
-        let mut found = Self {
-            nodes: vec![None; plan.nodes.len()],
-            unknown: 0,
-            scenes: estimator.scenes.values().map(SceneImages::summary).collect(),
-        };
-        for (index, state) in states.iter().enumerate().filter(|(_, state)| !is_cached(state)) {
-            found.nodes[index] = estimator.estimate(&plan.nodes[index], state);
-            found.unknown += usize::from(found.nodes[index].is_none());
-        }
-        found
-    }
-
-    /// Returns the estimate of a node.
-    pub(crate) fn get(&self, index: usize) -> Option<&Estimate> {
-        self.nodes.get(index)?.as_ref()
-    }
-
-    /// Returns all estimates, with node indices.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (usize, &Estimate)> {
-        self.nodes.iter().enumerate().filter_map(|(index, node)| Some((index, node.as_ref()?)))
-    }
-
-    /// Returns the processor seconds of all nodes.
-    pub(crate) fn processor_seconds(&self) -> f64 {
-        self.iter().map(|(_, estimate)| estimate.processor_seconds).sum()
-    }
-
-    /// Returns the largest memory of a node.
-    pub(crate) fn memory(&self) -> u64 {
-        self.iter().map(|(_, estimate)| estimate.memory).max().unwrap_or(0)
+        let estimator = Estimator::new(planned);
+        let missing = states.iter().enumerate().filter(|(_, state)| !is_cached(state));
+        let nodes: BTreeMap<usize, Estimate> = missing
+            .clone()
+            .filter_map(|(index, state)| {
+                Some((index, estimator.estimate(&plan.nodes[index], state)?))
+            })
+            .collect();
+        let unknown = missing.count() - nodes.len();
+        let scenes = estimator.scenes.values().map(SceneImages::summary).collect();
+        Self { nodes, unknown, scenes }
     }
 }
 
@@ -115,7 +94,8 @@ struct Estimator<'a> {
 }
 
 impl<'a> Estimator<'a> {
-    fn new(plan: &'a Plan, states: &[State], store: &Store) -> Self {
+    fn new(planned: &'a Planned<'_>) -> Self {
+        let Planned { store, plan, states } = planned;
         let mut scenes = BTreeMap::new();
         for (index, node) in plan.nodes.iter().enumerate() {
             if node.program.description.name == "prep"
@@ -138,7 +118,7 @@ impl<'a> Estimator<'a> {
         let model = model_cost(program, &node.parameters, &work)?;
         let earlier =
             self.nearest(node, state, model).and_then(|record| corrections(record, model));
-        let (time, memory) = earlier.unwrap_or_else(|| (machine::slowness(), 1.0));
+        let (time, memory) = earlier.unwrap_or_else(|| (slowness(), 1.0));
         let min_memory = min_memory(program, &node.parameters, &work)?;
         Some(Estimate {
             processor_seconds: time * model.processor_seconds,
@@ -154,7 +134,7 @@ impl<'a> Estimator<'a> {
         let program = node.program.description.name.as_str();
         let known_parts = match state {
             State::WillRun { key_parts } => key_parts.clone(),
-            _ => partial_key_parts(node),
+            _ => planning::key_parts(node, &[], self.plan.device(&node.stage)),
         };
         let similar = self.records.iter().filter(|record| {
             let Some(other) = record.model else { return false };
@@ -171,7 +151,10 @@ impl<'a> Estimator<'a> {
         let program = node.program.description.name.as_str();
         let has_input = |name: &str| node.inputs.iter().any(|input| input.name == name);
         match program {
-            "demo-scene" => return Work::of_demo(&node.parameters, self.threads),
+            "demo-scene" => {
+                let scene = SceneImages::of_demo(&node.parameters, &Value::Null)?;
+                return Some(Work::of_demo(&scene, self.threads));
+            }
             "camera-path" => return Some(Work::default()),
             _ => {}
         }
@@ -185,7 +168,7 @@ impl<'a> Estimator<'a> {
         let scene = self.scenes.get(&index)?;
         let training = match program {
             "train-ss" => Some(node),
-            _ => self.field(node),
+            _ => parent(node, "field").map(|(index, _)| &self.plan.nodes[index]),
         };
         let lr_images = training.and_then(|training| self.images(training)).map(|(_, lr)| lr);
         let lr_width = lr_images.unwrap_or_default().largest_size.0;
@@ -222,11 +205,8 @@ impl<'a> Estimator<'a> {
             // Views are as many and as large as the cameras that they were rendered from.
             None => return self.images(parent).filter(|_| input == "views"),
         };
-        if input == "cameras"
-            && node.program.description.name == "render-depth"
-            && let Some(width) = node.parameters["size"].as_f64()
-        {
-            images = images.resized(width);
+        if node.program.description.name == "render-depth" {
+            images = images.with_size(&node.parameters);
         }
         Some((index, images))
     }
@@ -236,28 +216,12 @@ impl<'a> Estimator<'a> {
         let (index, _) = parent(path, "cameras")?;
         let recorded = path.inputs.iter().find(|input| input.name == "path");
         let frames = match recorded.map(|input| &input.from) {
-            None => path::computed(&path.parameters, self.scenes.get(&index)?),
-            Some(Origin::Folder(folder)) => path::recorded(&path.parameters, folder),
+            None => computed_frames(&path.parameters, self.scenes.get(&index)?),
+            Some(Origin::Folder(folder)) => recorded_frames(&path.parameters, folder),
             Some(Origin::Node { .. }) => None,
         };
         Some((index, frames?))
     }
-
-    /// Returns the node that trains the field which a node renders.
-    fn field(&self, node: &Node) -> Option<&'a Node> {
-        let (index, _) = parent(node, "field")?;
-        Some(&self.plan.nodes[index])
-    }
-}
-
-/// Returns the known parts of a key whose inputs are unknown.
-fn partial_key_parts(node: &Node) -> Map<String, Value> {
-    let partial = node.partial_key();
-    let parameters = partial.parameters.into_iter();
-    let mut parts: Map<String, Value> =
-        parameters.map(|(name, value)| (format!("parameter {name}"), value)).collect();
-    parts.insert("stage".to_owned(), json!(partial.program));
-    parts
 }
 
 /// Returns the factors by which the model's time and memory are corrected after an earlier run.

@@ -3,9 +3,10 @@
 use std::path::Path;
 
 use artifact::format_count;
-use dataset::{Dataset, Format, Frame, Split};
+use dataset::{Dataset, Format, Split};
 use pixels::{DEGRADATION_FILE, Filter, Kernel};
-use scene::VIEWS_FILE;
+use scene::{Background, Intrinsics, Space, VIEWS_FILE, Views};
+use serde::Deserialize;
 use serde_json::Value;
 use workload::preparation_bytes;
 
@@ -21,7 +22,7 @@ const CONTRACTION_WIDTHS: f64 = 2.0;
 const READING_BYTES: u64 = 4 + 4 + 6;
 
 /// Images of a scene, by the folders of the artifact that `prep` creates.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct SceneImages {
     pub(crate) kind: SceneKind,
     /// Width of the field's cube, in widths of an LR image.
@@ -43,7 +44,6 @@ const FOLDERS: [&str; 6] =
 /// Scene that `prep` will read.
 struct PlannedScene {
     kind: SceneKind,
-    widths_across: f64,
     /// Sizes of all photographs.
     sizes: Vec<(f64, f64)>,
     split: Split,
@@ -53,27 +53,19 @@ struct PlannedScene {
 impl SceneImages {
     /// Reads the images of an existing artifact.
     pub(crate) fn of_artifact(artifact: &Path) -> Option<Self> {
-        let mut scene = Self {
-            kind: SceneKind::Object,
-            widths_across: 1.0,
-            has_box_kernel: false,
-            photographs: Images::default(),
-            preparation_bytes: 0,
-            folders: Vec::new(),
-        };
+        let mut scene = Self { widths_across: 1.0, ..Self::default() };
         for folder in FOLDERS {
             let Ok(bytes) = std::fs::read(artifact.join(folder).join(VIEWS_FILE)) else {
                 continue;
             };
-            let views: Value = serde_json::from_slice(&bytes).ok()?;
-            let (space, list) = (&views["bounds"]["space"], views["views"].as_array()?);
-            scene.kind = kind_of(views["background"] == "opaque", space.get("ndc").is_some());
-            scene.widths_across = widths_across(space, list).unwrap_or(1.0);
-            let sizes = list.iter().map(|view| {
-                let size = &view["camera"]["intrinsics"];
-                Some((size["width"].as_f64()?, size["height"].as_f64()?))
-            });
-            scene.folders.push((folder, images_of(&sizes.collect::<Option<Vec<_>>>()?)));
+            let Views { background, bounds, views, .. } = serde_json::from_slice(&bytes).ok()?;
+            let is_ndc = matches!(bounds.space, Space::Ndc(_));
+            scene.kind = kind_of(background == Background::Opaque, is_ndc);
+            let sizes: Vec<Intrinsics> = views.iter().map(|view| view.camera.intrinsics).collect();
+            scene.widths_across =
+                sizes.first().map_or(1.0, |size| widths_across(&bounds.space, size));
+            let sizes: Vec<(f64, f64)> = sizes.into_iter().map(size_of).collect();
+            scene.folders.push((folder, images_of(&sizes)));
         }
         if let Ok(bytes) = std::fs::read(artifact.join("train").join(DEGRADATION_FILE)) {
             let degradation: Value = serde_json::from_slice(&bytes).ok()?;
@@ -99,11 +91,9 @@ impl SceneImages {
         let is_opaque = background.map_or(!is_object, |background| background == "opaque");
         let space = parameters["space"].as_str();
         let is_ndc = space.map_or(set.format == Format::Llff, |space| space == "ndc");
-        let kind = kind_of(is_opaque, is_ndc);
         let planned = PlannedScene {
-            kind,
-            widths_across: planned_widths_across(kind, space),
-            sizes: set.frames.iter().map(size_of).collect(),
+            kind: kind_of(is_opaque, is_ndc),
+            sizes: set.frames.iter().map(|frame| size_of(frame.intrinsics())).collect(),
             split,
             is_benchmark: set.format.is_benchmark(),
         };
@@ -119,10 +109,8 @@ impl SceneImages {
         let size = (width, (width / number("aspect")?).round());
         let train = train as usize;
         let all = train + test as usize;
-        let kind = kind_of(demo["backdrop"].as_bool()?, false);
         let planned = PlannedScene {
-            kind,
-            widths_across: planned_widths_across(kind, parameters["space"].as_str()),
+            kind: kind_of(demo["backdrop"].as_bool()?, false),
             sizes: vec![size; all],
             split: Split { train: (0..train).collect(), test: (train..all).collect() },
             is_benchmark: true,
@@ -136,7 +124,7 @@ impl SceneImages {
         parameters: &Value,
         reading_bytes: impl Fn(usize) -> u64,
     ) -> Self {
-        let PlannedScene { kind, widths_across, sizes, split, is_benchmark } = planned;
+        let PlannedScene { kind, sizes, split, is_benchmark } = planned;
         let number = |name: &str| parameters[name].as_f64();
         let lr_width = number("lr_width");
         let is_downscaled = match parameters["lr_source"].as_str() {
@@ -173,7 +161,7 @@ impl SceneImages {
         });
         Self {
             kind: *kind,
-            widths_across: *widths_across,
+            widths_across: planned_widths_across(*kind, &parameters["space"]),
             has_box_kernel: is_mean_kernel(&parameters["kernel"], !is_downscaled),
             photographs: images(&read, 1.0),
             preparation_bytes: preparation.max().unwrap_or(0),
@@ -225,21 +213,21 @@ fn kind_of(is_opaque: bool, is_ndc: bool) -> SceneKind {
 }
 
 /// Returns the width of the field's cube, in widths of a view, as in `train-ss`.
-fn widths_across(space: &Value, views: &[Value]) -> Option<f64> {
-    if space == "contraction" {
-        return Some(CONTRACTION_WIDTHS);
+fn widths_across(space: &Space, view: &Intrinsics) -> f64 {
+    match space {
+        Space::Box => 1.0,
+        Space::Contraction => CONTRACTION_WIDTHS,
+        Space::Ndc(frustum) => {
+            let side = |axis: usize| frustum.max[axis] - frustum.min[axis];
+            side(0).max(side(1)) * (view.fx / f64::from(view.width))
+        }
     }
-    let frustum = space.get("ndc")?;
-    let side = |axis: usize| Some(frustum["max"][axis].as_f64()? - frustum["min"][axis].as_f64()?);
-    let intrinsics = &views.first()?["camera"]["intrinsics"];
-    let focal_lengths = intrinsics["fx"].as_f64()? / intrinsics["width"].as_f64()?;
-    Some(side(0)?.max(side(1)?) * focal_lengths)
 }
 
-fn planned_widths_across(kind: SceneKind, space: Option<&str>) -> f64 {
+fn planned_widths_across(kind: SceneKind, space: &Value) -> f64 {
     match kind {
         SceneKind::Frustum => NDC_WIDTHS,
-        SceneKind::Unbounded if space != Some("box") => CONTRACTION_WIDTHS,
+        SceneKind::Unbounded if space != "box" => CONTRACTION_WIDTHS,
         SceneKind::Unbounded | SceneKind::Object => 1.0,
     }
 }
@@ -250,9 +238,8 @@ fn is_mean_kernel(kernel: &Value, by_default: bool) -> bool {
     kernel.map_or(by_default, |kernel| kernel.filter() == Filter::Box)
 }
 
-fn size_of(frame: &Frame) -> (f64, f64) {
-    let size = frame.intrinsics();
-    (f64::from(size.width), f64::from(size.height))
+fn size_of(image: Intrinsics) -> (f64, f64) {
+    (f64::from(image.width), f64::from(image.height))
 }
 
 /// Returns number and size of images with the given widths and heights.
@@ -265,8 +252,40 @@ fn images_of(sizes: &[(f64, f64)]) -> Images {
     }
 }
 
+/// Name of a recorded path's file.
+const PATH_FILE: &str = "camera_path.json";
+
+/// Part of a recorded path.
+#[derive(Deserialize)]
+struct PathFile {
+    render_width: f64,
+    render_height: f64,
+    camera_path: Vec<Value>,
+}
+
+/// Returns the frames of a path that `camera-path` computes: as large as the scene's HR images,
+/// unless parameter `size` gives the frames' width.
+pub(super) fn computed_frames(parameters: &Value, scene: &SceneImages) -> Option<Images> {
+    let count = parameters["frames"].as_u64()?;
+    Some(frames(count, scene.images("train-cameras")?.largest_size, parameters))
+}
+
+/// Returns the frames of a recorded path; `None` if its file can't be read.
+pub(super) fn recorded_frames(parameters: &Value, folder: &Path) -> Option<Images> {
+    let bytes = std::fs::read(folder.join(PATH_FILE)).ok()?;
+    let path: PathFile = serde_json::from_slice(&bytes).ok()?;
+    let size = (path.render_width as u64, path.render_height as u64);
+    Some(frames(path.camera_path.len() as u64, size, parameters))
+}
+
+fn frames(count: u64, largest_size: (u64, u64), parameters: &Value) -> Images {
+    let pixels = largest_size.0.saturating_mul(largest_size.1).saturating_mul(count);
+    Images { count, pixels, largest_size }.with_size(parameters)
+}
+
 #[cfg(test)]
 mod tests {
+    use scene::{Bounds, Camera, Frustum, View};
     use serde_json::json;
 
     use super::*;
@@ -307,7 +326,6 @@ mod tests {
     fn photographs_are_the_lr_images() {
         let planned = PlannedScene {
             kind: SceneKind::Unbounded,
-            widths_across: 2.0,
             sizes: vec![(640.0, 480.0); 9],
             split: Split::hold_out(9),
             is_benchmark: false,
@@ -333,21 +351,47 @@ mod tests {
         assert!(SceneImages::of_artifact(folder.path()).unwrap().images("train").is_none());
         let train = folder.path().join("train");
         std::fs::create_dir(&train).unwrap();
-        let view = json!({"camera": {"intrinsics": {"width": 30, "height": 20, "fx": 45.0}}});
-        let scene_in = |space: Value| {
-            let views = json!({
-                "background": "opaque", "bounds": {"space": space}, "views": [view, view],
-            });
-            std::fs::write(train.join(VIEWS_FILE), views.to_string()).unwrap();
+        let intrinsics = Intrinsics { fx: 45.0, ..Intrinsics::from_angle_x(30, 20, 0.7) };
+        let camera_to_world = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
+        let view = |name: &str| {
+            let name = name.to_owned();
+            View::camera_only(Camera { name, intrinsics, camera_to_world })
+        };
+        let scene_in = |space: Space| {
+            let bounds = Bounds { space, ..Bounds::cube(1.0, 2.0, 6.0) };
+            let views = Views::new(Background::Opaque, bounds, vec![view("a"), view("b")]);
+            artifact::write_json(&train.join(VIEWS_FILE), &views).unwrap();
             SceneImages::of_artifact(folder.path()).unwrap()
         };
-        let scene = scene_in(json!("contraction"));
+        let scene = scene_in(Space::Contraction);
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Unbounded, 2.0));
         let images = Images { count: 2, pixels: 1200, largest_size: (30, 20) };
         assert_eq!(scene.images("train"), Some(images));
-        let scene = scene_in(json!({"ndc": {"min": [-0.5, -0.25], "max": [0.5, 0.25]}}));
+        let frustum =
+            Frustum { camera_to_world, min: [-0.5, -0.25], max: [0.5, 0.25], near: 1.0, far: 2.0 };
+        let scene = scene_in(Space::Ndc(frustum));
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Frustum, 1.5));
         std::fs::write(train.join(VIEWS_FILE), "{").unwrap();
         assert!(SceneImages::of_artifact(folder.path()).is_none());
+    }
+
+    #[test]
+    fn frames_follow_from_parameters_or_a_recorded_path() {
+        let demo = json!({"size": 200, "aspect": 2.0, "train": 8, "test": 2, "backdrop": false});
+        let scene = SceneImages::of_demo(&demo, &json!({"scale": 2})).unwrap();
+        let images = |count, largest_size: (u64, u64)| {
+            Some(Images { count, pixels: count * largest_size.0 * largest_size.1, largest_size })
+        };
+        let parameters = json!({"frames": 120});
+        assert_eq!(computed_frames(&parameters, &scene), images(120, (200, 100)));
+        let parameters = json!({"frames": 3, "size": 50});
+        assert_eq!(computed_frames(&parameters, &scene), images(3, (50, 25)));
+
+        let folder = tempfile::tempdir().unwrap();
+        assert_eq!(recorded_frames(&parameters, folder.path()), None);
+        let file = json!({"render_width": 40, "render_height": 30.0, "camera_path": [{}, {}]});
+        std::fs::write(folder.path().join(PATH_FILE), file.to_string()).unwrap();
+        assert_eq!(recorded_frames(&json!({"size": null}), folder.path()), images(2, (40, 30)));
+        assert_eq!(recorded_frames(&json!({"size": 80}), folder.path()), images(2, (80, 60)));
     }
 }

@@ -6,7 +6,6 @@ use stage::MEMORY_REMEDY;
 use store::Record;
 
 use super::{Estimate, Estimates};
-use crate::state_text::processors_text;
 
 impl Estimate {
     /// Returns time and memory as text.
@@ -23,8 +22,8 @@ fn cost_text(processor_seconds: f64, memory: u64) -> String {
 impl Estimates {
     /// Returns the cost of all nodes as text; `None` if there are no estimates.
     pub(crate) fn total_text(&self, processors: usize) -> Option<String> {
-        self.iter().next()?;
-        let seconds = self.processor_seconds();
+        let memory = self.nodes.values().map(|estimate| estimate.memory).max()?;
+        let seconds: f64 = self.nodes.values().map(|estimate| estimate.processor_seconds).sum();
         let without = match self.unknown {
             0 => String::new(),
             count => format!("; no estimate for {}", format_count(count, "other stage")),
@@ -33,8 +32,8 @@ impl Estimates {
             "about {} of processor time: {} on {}; at most {} of memory for a stage{without}",
             format_duration(seconds),
             format_duration(seconds / processors as f64),
-            processors_text(processors),
-            format_size(self.memory())
+            format_count(processors, "processor"),
+            format_size(memory)
         ))
     }
 }
@@ -44,8 +43,8 @@ impl Estimates {
 pub(crate) fn run_text(plan: &Plan, estimates: &Estimates, processors: usize) -> Option<String> {
     let total = estimates.total_text(processors)?;
     let mut blocks: Vec<(&str, f64)> = Vec::new();
-    for (index, estimate) in estimates.iter() {
-        let name = plan.nodes[index].stage.as_str();
+    for (index, estimate) in &estimates.nodes {
+        let name = plan.nodes[*index].stage.as_str();
         match blocks.iter_mut().find(|(other, _)| *other == name) {
             Some((_, seconds)) => *seconds += estimate.processor_seconds,
             None => blocks.push((name, estimate.processor_seconds)),
@@ -71,7 +70,9 @@ pub(crate) fn total_comparison_text<'a>(
 ) -> Option<String> {
     let (mut took, mut estimated) = (0.0, 0.0);
     for (index, record) in ran {
-        if let (Some(estimate), Some(seconds)) = (estimates.get(index), record.processor_seconds) {
+        if let (Some(estimate), Some(seconds)) =
+            (estimates.nodes.get(&index), record.processor_seconds)
+        {
             took += seconds;
             estimated += estimate.processor_seconds;
         }
@@ -86,19 +87,15 @@ pub(crate) fn total_comparison_text<'a>(
     })
 }
 
-/// Fails if a node needs more than the free memory, if that is known.
-pub(crate) fn check_memory(
-    plan: &Plan,
-    estimates: &Estimates,
-    free: Option<u64>,
-) -> Result<(), Failure> {
-    let Some(free) = free else { return Ok(()) };
-    let Some((index, estimate)) = estimates.iter().find(|(_, node)| node.min_memory > free) else {
+/// Fails if a node needs more than the free memory.
+pub(crate) fn check_memory(plan: &Plan, estimates: &Estimates, free: u64) -> Result<(), Failure> {
+    let Some((index, estimate)) = estimates.nodes.iter().find(|(_, node)| node.min_memory > free)
+    else {
         return Ok(());
     };
     Err(Failure::Usage(format!(
         "{} needs about {} of memory, and {} are free, so nothing was run; {MEMORY_REMEDY}",
-        plan.nodes[index].label(),
+        plan.nodes[*index].label(),
         format_size(estimate.min_memory),
         format_size(free)
     )))
@@ -106,6 +103,8 @@ pub(crate) fn check_memory(
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use store::ModelCost;
 
     use super::*;
@@ -116,7 +115,8 @@ mod tests {
     }
 
     fn estimates(unknown: usize) -> Estimates {
-        let nodes = vec![Some(estimate(10.0, 2_000_000)), None, Some(estimate(30.0, 1_000_000))];
+        let nodes =
+            BTreeMap::from([(0, estimate(10.0, 2_000_000)), (2, estimate(30.0, 1_000_000))]);
         Estimates { nodes, unknown, scenes: Vec::new() }
     }
 

@@ -4,6 +4,8 @@ use radiance::{Architecture, GivenSizes};
 use serde::Deserialize as _;
 use serde_json::Value;
 
+use super::scene::SceneImages;
+
 /// Kind of scene, on which the cost of a ray depends.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum SceneKind {
@@ -39,8 +41,10 @@ impl Images {
         self.largest_size.0 * self.largest_size.1
     }
 
-    /// Returns the same number of images, scaled to another width.
-    pub(crate) fn resized(&self, width: f64) -> Self {
+    /// Returns the same number of images, scaled to the width of the parameter `size` if that is
+    /// set.
+    pub(crate) fn with_size(self, parameters: &Value) -> Self {
+        let Some(width) = parameters["size"].as_f64() else { return self };
         let factor = width / self.largest_size.0.max(1) as f64;
         let scaled = |side: u64| (side as f64 * factor).round() as u64;
         let pixels = (self.pixels as f64 * factor.powi(2)) as u64;
@@ -77,16 +81,8 @@ pub(crate) struct Work {
 
 impl Work {
     /// Returns the work of rendering the demo scene.
-    pub(crate) fn of_demo(demo: &Value, threads: u64) -> Option<Self> {
-        let number = |name: &str| demo[name].as_f64();
-        let (width, count) = (number("size")?, number("train")? + number("test")?);
-        let largest_size = (width as u64, (width / number("aspect")?).round() as u64);
-        let kind =
-            if demo["backdrop"].as_bool()? { SceneKind::Unbounded } else { SceneKind::Object };
-        let count = count as u64;
-        let images =
-            Images { count, pixels: count * largest_size.0 * largest_size.1, largest_size };
-        Some(Self { kind, images, threads, ..Self::default() })
+    pub(crate) fn of_demo(scene: &SceneImages, threads: u64) -> Self {
+        Self { kind: scene.kind, images: scene.photographs, threads, ..Self::default() }
     }
 
     /// Returns the architecture of a grid that is trained with some parameters.

@@ -1,9 +1,10 @@
 //! Admission of stages: a stage starts if a slot, a core and its memory are free (docs/design/036).
 
 use std::collections::BTreeMap;
+use std::num::NonZeroUsize;
 
 use artifact::{format_count, format_size, report_line};
-use planning::{PlanError, nearest_record};
+use planning::nearest_record;
 use serde_json::{Map, Value};
 use stage::{ALL_PROCESSORS, Processors, machine_memory, processors};
 use store::Record;
@@ -28,14 +29,10 @@ const DEFAULT_DEMAND: Demand = Demand { cores: 1, memory: 0 };
 
 impl Demand {
     /// Estimates a stage's demand from its measured run with the nearest key.
-    pub(crate) fn estimate(
-        key_parts: &Map<String, Value>,
-        stage: &str,
-        records: &[Record],
-    ) -> Self {
+    pub(crate) fn estimate(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Self {
         let measured =
             records.iter().filter(|record| record.peak_memory.is_some() && record.stage == stage);
-        let Some(record) = nearest_record(key_parts, measured) else { return DEFAULT_DEMAND };
+        let Some(record) = nearest_record(parts, measured) else { return DEFAULT_DEMAND };
         // Short stages may have measured 0 seconds; the minimum was chosen by hand.
         let seconds = record.seconds.max(1e-3);
         let cores = record.processor_seconds.map_or(1, |busy| (busy / seconds).round() as usize);
@@ -61,20 +58,18 @@ pub(crate) struct Budget {
 impl Budget {
     /// Creates the budget for `--jobs`, `--threads` and `--memory` in bytes.
     pub(crate) fn new(
-        jobs: Option<usize>,
-        threads: Option<usize>,
+        jobs: Option<NonZeroUsize>,
+        threads: Option<NonZeroUsize>,
         memory: Option<u64>,
-    ) -> Result<Self, PlanError> {
-        if jobs == Some(0) || threads == Some(0) {
-            return Err(PlanError::Usage("--jobs and --threads must be at least 1".to_owned()));
-        }
+    ) -> Self {
         let Processors { count: cores, limit } = processors();
-        Ok(Self {
-            stages: capped("--jobs", jobs.unwrap_or(cores.min(DEFAULT_MAX_STAGES)), cores),
-            cores: capped("--threads", threads.unwrap_or(cores), cores),
+        let stages = jobs.map_or(cores.min(DEFAULT_MAX_STAGES), NonZeroUsize::get);
+        Self {
+            stages: capped("--jobs", stages, cores),
+            cores: capped("--threads", threads.map_or(cores, NonZeroUsize::get), cores),
             memory: memory.or_else(machine_memory).unwrap_or(u64::MAX),
             limit: Some(limit).filter(|&limit| threads.is_none() && limit != ALL_PROCESSORS),
-        })
+        }
     }
 
     /// Returns the line that names a limit below the machine's number of processors.
@@ -86,11 +81,14 @@ impl Budget {
     /// Decides whether a stage may start next to the running ones: a slot, a core and its memory
     /// must be free. One free core is enough for a stage of several threads.
     pub(crate) fn admission(&self, running: &BTreeMap<usize, Demand>, demand: Demand) -> Admission {
-        let (needed, memory_limit) = (format_size(demand.memory), format_size(self.memory));
+        let problem = format!(
+            "needs {} of memory, as in its most similar earlier run, but",
+            format_size(demand.memory)
+        );
+        let memory_limit = format_size(self.memory);
         if demand.memory > self.memory {
             return Admission::TooLarge(format!(
-                "needs {needed} of memory, as in its most similar earlier run, but the limit is \
-                {memory_limit}; change the limit with --memory"
+                "{problem} the limit is {memory_limit}; change the limit with --memory"
             ));
         }
         let busy: usize = running.values().map(|demand| demand.cores).sum();
@@ -102,11 +100,8 @@ impl Budget {
         if demand.memory <= free {
             return Admission::Start;
         }
-        Admission::WaitForMemory(format!(
-            "needs {needed} of memory, as in its most similar earlier run, but {} of \
-            {memory_limit} are free",
-            format_size(free)
-        ))
+        let free = format_size(free);
+        Admission::WaitForMemory(format!("{problem} {free} of {memory_limit} are free"))
     }
 }
 

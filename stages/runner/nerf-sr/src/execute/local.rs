@@ -6,22 +6,20 @@ use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc;
 
-use anyhow::Context as _;
 use artifact::{Failure, print_line, print_lines, report_line, report_text};
-use planning::stage_call::{Display, StageFailure};
+use planning::stage_call::{Display, StageFailure, read_summary};
 use planning::{Node, Sink};
-use stage::{SUMMARY_FILE, available_memory};
+use stage::available_memory;
 use store::Record;
 
-use super::Executor;
 use super::budget::{Admission, Budget, Demand};
 use super::node::{Lookup, NodeJob, PendingAction, input_folder};
 use crate::estimates::{check_memory, run_text, total_comparison_text};
-use crate::failure;
-use crate::run_messages::{FailureHint, end_message};
+use crate::run_messages::{command_text, end_message, failure_message};
 use crate::run_record::RunProgress;
 use crate::session::{Run, command_line};
-use crate::sink::{SinkResult, run_sink};
+use crate::sink::run_sink;
+use crate::stage_failure;
 use crate::watch::{Chain, Watch};
 
 /// This machine.
@@ -30,116 +28,109 @@ pub(crate) struct Local {
     pub(crate) budget: Budget,
     /// True if stages that don't depend on a failed one still run.
     pub(crate) keep_going: bool,
-    /// Message after a failure.
-    pub(crate) hint: FailureHint,
+    /// Arguments of this plan for another verb.
+    pub(crate) plan_arguments: Vec<String>,
     /// Options of `--watch`.
     pub(crate) watch: Option<Watch>,
 }
 
-impl Executor for Local {
-    fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
+impl Local {
+    /// Runs missing nodes, then the sinks. Returns the run's exit code.
+    pub(crate) fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
         let plan = run.plan;
-        let free = available_memory()?.into_iter().chain([self.budget.memory]).min();
+        let free = available_memory()?.unwrap_or(u64::MAX).min(self.budget.memory);
         check_memory(plan, run.estimates, free)?;
         if let Some(text) = run_text(plan, run.estimates, self.budget.cores) {
             report_text(&format!("nerf-sr: {text}"));
         }
-        let outcome = run_nodes(run, self);
+        let (progress, skipped) = run_nodes(run, self);
         if run.stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
         }
-        if let Some((index, failure)) = outcome.failures.first() {
+        if let Some((index, failure)) = progress.failures.first() {
             // Without any result, pages are written only with --keep-going: a table then names the
             // failed stages.
-            if self.keep_going || outcome.records.iter().any(Option::is_some) {
+            if self.keep_going || progress.records.iter().any(Option::is_some) {
                 let partial = plan.sinks.iter().filter(|sink| sink.program.description.partial);
                 // A sink's failure doesn't replace the stage's exit code.
-                if let Err(error) = self.run_sinks(run, partial, &outcome) {
+                if let Err(error) = self.run_sinks(run, partial, &progress) {
                     report_line!("nerf-sr: {error:#}");
                 }
             }
             let node = &plan.nodes[*index];
-            let skipped = outcome.skipped;
-            report_text(&self.hint.message(&node.label(), &node.stage, skipped));
+            let log_command = self.log_command(&node.stage);
+            report_text(&failure_message(&node.label(), skipped, &log_command));
             return Ok(ExitCode::from(failure.code));
         }
-        print_summaries(run, &outcome)?;
-        let sinks = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
-        if let Some(code) = sinks.first_failure {
+        print_summaries(run, &progress);
+        let (has_written, first_failure) = self.run_sinks(run, plan.sinks.iter(), &progress)?;
+        if let Some(code) = first_failure {
             return Ok(ExitCode::from(code));
         }
-        let ran = outcome.ran.iter();
-        let ran = ran.filter_map(|&index| Some((index, outcome.records[index].as_ref()?)));
+        let ran = progress.ran.iter().flatten();
+        let end = end_message(ran.clone().count(), plan.nodes.len(), has_written);
+        let ran = ran.filter_map(|&index| Some((index, progress.records[index].as_ref()?)));
         let comparison = total_comparison_text(run.estimates, ran);
-        let end = end_message(outcome.ran.len(), plan.nodes.len(), sinks.has_written);
         print_line!("{end}{}", comparison.map_or_else(String::new, |text| format!("; {text}")));
         Ok(ExitCode::SUCCESS)
     }
-}
 
-impl Local {
-    /// Runs sinks, and prints the paths of their pages and their failures.
+    /// Returns the command that prints a stage's log.
+    fn log_command(&self, stage: &str) -> String {
+        let command = command_line();
+        let program = command.first().map_or("nerf-sr", String::as_str);
+        let arguments = self.plan_arguments.iter().map(String::as_str);
+        command_text([program, "log", stage].into_iter().chain(arguments))
+    }
+
+    /// Runs sinks, and prints the paths of their pages and their failures. Returns whether a page
+    /// was written, and the exit code of the first sink that failed.
     fn run_sinks<'a>(
         &self,
         run: &Run<'_>,
         sinks: impl Iterator<Item = &'a Sink>,
-        outcome: &Outcome,
-    ) -> anyhow::Result<SinksOutcome> {
-        let progress = RunProgress {
-            records: &outcome.records,
-            ran: Some(&outcome.ran),
-            failures: &outcome.failures,
-            command: &command_line(),
-        };
-        let mut sinks_outcome = SinksOutcome::default();
+        progress: &RunProgress,
+    ) -> anyhow::Result<(bool, Option<u8>)> {
+        let (mut any_written, mut first_failure) = (false, None);
         for sink in sinks {
-            let result = run_sink(run, sink, self.budget.cores, &progress);
+            let result = run_sink(run, sink, self.budget.cores, progress);
             if run.stop.load(Ordering::Relaxed) {
                 return Err(Failure::Interrupted.into());
             }
             match result {
-                Ok(result) => {
-                    result.print(&sink.stage);
-                    sinks_outcome.has_written |= matches!(result, SinkResult::Written { .. });
-                }
-                Err(failure) => {
-                    report_line!("nerf-sr: {}: {failure}", sink.stage);
-                    sinks_outcome.first_failure.get_or_insert(failure.code);
+                Ok(is_written) => any_written |= is_written,
+                Err(error) => {
+                    let StageFailure { code, message } = stage_failure(&error);
+                    report_line!("nerf-sr: {}: {message}", sink.stage);
+                    first_failure.get_or_insert(code);
                 }
             }
         }
-        Ok(sinks_outcome)
+        Ok((any_written, first_failure))
     }
 }
 
-/// Outcome of a run's sinks.
-#[derive(Default)]
-struct SinksOutcome {
-    /// True if a page was written.
-    has_written: bool,
-    /// Exit code of the first sink that failed.
-    first_failure: Option<u8>,
-}
-
-/// Outcome of a run's nodes.
-struct Outcome {
-    /// Records by node index; `None` if the node isn't done.
-    records: Vec<Option<Record>>,
-    /// Nodes that ran.
-    ran: BTreeSet<usize>,
-    /// Nodes that failed.
-    failures: Vec<(usize, StageFailure)>,
-    /// Number of nodes that were skipped because of the failures.
-    skipped: usize,
-}
-
-/// Report of a worker: the node, its record, and whether the stage ran.
-type WorkerReport = (usize, Result<(Record, bool), StageFailure>);
-
-fn run_nodes(run: &Run<'_>, options: &Local) -> Outcome {
+/// Runs the nodes. Returns their progress, and the number of nodes that were skipped because of
+/// failures.
+fn run_nodes(run: &Run<'_>, options: &Local) -> (RunProgress, usize) {
     let display = Display::default();
-    let mut schedule = Schedule::new(run, options, &display);
-    let (sender, reports) = mpsc::channel::<WorkerReport>();
+    let count = run.plan.nodes.len();
+    let mut schedule = Schedule {
+        run,
+        options,
+        display: &display,
+        pending: (0..count).collect(),
+        ready: BTreeMap::new(),
+        running: BTreeMap::new(),
+        records: OnceCell::new(),
+        progress: RunProgress {
+            records: vec![None; count],
+            ran: Some(BTreeSet::new()),
+            command: command_line(),
+            ..RunProgress::default()
+        },
+    };
+    let (sender, reports) = mpsc::channel();
     std::thread::scope(|scope| {
         loop {
             schedule.look_up_nodes();
@@ -151,12 +142,12 @@ fn run_nodes(run: &Run<'_>, options: &Local) -> Outcome {
             if schedule.running.is_empty() {
                 break;
             }
-            let Ok(report) = reports.recv() else { break };
-            schedule.finish(report);
+            let Ok((index, result)) = reports.recv() else { break };
+            schedule.finish(index, result);
         }
     });
     let skipped = schedule.pending.len() + schedule.ready.len();
-    Outcome { skipped, ..schedule.outcome }
+    (schedule.progress, skipped)
 }
 
 /// Progress of a run's nodes.
@@ -172,7 +163,7 @@ struct Schedule<'a> {
     running: BTreeMap<usize, Demand>,
     /// All records of the store, read when the first node isn't cached.
     records: OnceCell<Vec<Record>>,
-    outcome: Outcome,
+    progress: RunProgress,
 }
 
 /// A node that isn't cached and whose parents are done.
@@ -184,29 +175,10 @@ struct ReadyNode {
 }
 
 impl<'a> Schedule<'a> {
-    fn new(run: &'a Run<'a>, options: &'a Local, display: &'a Display) -> Self {
-        let count = run.plan.nodes.len();
-        Self {
-            run,
-            options,
-            display,
-            pending: (0..count).collect(),
-            ready: BTreeMap::new(),
-            running: BTreeMap::new(),
-            records: OnceCell::new(),
-            outcome: Outcome {
-                records: vec![None; count],
-                ran: BTreeSet::new(),
-                failures: Vec::new(),
-                skipped: 0,
-            },
-        }
-    }
-
     /// True if no further node may start.
     fn is_stopping(&self) -> bool {
         self.run.stop.load(Ordering::Relaxed)
-            || (!self.options.keep_going && !self.outcome.failures.is_empty())
+            || (!self.options.keep_going && !self.progress.failures.is_empty())
     }
 
     fn report(&self, index: usize, text: &str) {
@@ -217,22 +189,22 @@ impl<'a> Schedule<'a> {
         let node = &self.run.plan.nodes[index];
         let parents = node
             .parents()
-            .filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?)))
+            .filter_map(|parent| Some((parent, self.progress.records[parent].clone()?)))
             .collect();
         let threads = self.options.budget.cores;
         let (run, display) = (self.run, self.display);
-        let estimate = run.estimates.get(index).copied();
+        let estimate = run.estimates.nodes.get(&index).copied();
         NodeJob { run, node, parents, threads, display, estimate, watch: None }
     }
 
     /// Finds the stages that render and score a node's checkpoints, if `--watch` is given.
-    fn watch(&self, index: usize) -> Option<(&'a Watch, Chain)> {
+    fn watch(&self, index: usize) -> Option<(&'a Watch, Chain<'a>)> {
         let plan = self.run.plan;
         let has_checkpoints = plan.nodes[index].program.description.from_checkpoint;
         let watch = self.options.watch.as_ref().filter(|_| has_checkpoints)?;
         let chain = Chain::find(plan, index, &|origin| {
             input_folder(origin, self.run.store, &|index| {
-                self.outcome.records[index].as_ref().map(|record| record.output.clone())
+                self.progress.records[index].as_ref().map(|record| record.output.clone())
             })
         });
         if chain.is_none() {
@@ -248,13 +220,13 @@ impl<'a> Schedule<'a> {
         for index in self.pending.clone() {
             let node = &self.run.plan.nodes[index];
             if self.is_stopping()
-                || node.parents().any(|parent| self.outcome.records[parent].is_none())
+                || node.parents().any(|parent| self.progress.records[parent].is_none())
             {
                 continue;
             }
             self.pending.remove(&index);
             match self.job(index).look_up() {
-                Ok(Lookup::Cached(record)) => self.outcome.records[index] = Some(record),
+                Ok(Lookup::Cached(record)) => self.progress.records[index] = Some(record),
                 Ok(Lookup::Pending(action)) => {
                     let records = self.records.get_or_init(|| {
                         if let Some(line) = self.options.budget.limit_line() {
@@ -266,7 +238,7 @@ impl<'a> Schedule<'a> {
                     let demand = Demand::estimate(&action.key_parts, &node.stage, records);
                     self.ready.insert(index, ReadyNode { action, demand, is_reported: false });
                 }
-                Err(failure) => self.fail(index, failure),
+                Err(error) => self.fail(index, &error),
             }
         }
     }
@@ -283,7 +255,7 @@ impl<'a> Schedule<'a> {
                     continue;
                 }
                 Admission::TooLarge(message) if !self.is_stopping() => {
-                    self.fail(index, failure(message));
+                    self.fail(index, &anyhow::Error::msg(message));
                     continue;
                 }
                 Admission::WaitForMemory(reason) if !node.is_reported => {
@@ -297,45 +269,42 @@ impl<'a> Schedule<'a> {
         admitted
     }
 
-    /// Takes in a worker's report.
-    fn finish(&mut self, (index, result): WorkerReport) {
+    /// Takes in a worker's result: the record, and whether the stage ran.
+    fn finish(&mut self, index: usize, result: anyhow::Result<(Record, bool)>) {
         self.running.remove(&index);
         match result {
             Ok((record, ran)) => {
-                self.outcome.records[index] = Some(record);
+                self.progress.records[index] = Some(record);
                 if ran {
-                    self.outcome.ran.insert(index);
+                    self.progress.ran.get_or_insert_default().insert(index);
                 }
             }
-            Err(failure) => self.fail(index, failure),
+            Err(error) => self.fail(index, &error),
         }
     }
 
-    fn fail(&mut self, index: usize, failure: StageFailure) {
+    fn fail(&mut self, index: usize, error: &anyhow::Error) {
+        let failure = stage_failure(error);
         // A stage that was interrupted has not failed.
         let failed = if failure.code == Failure::Interrupted.exit_code() { "" } else { "failed: " };
         self.report(index, &format!("{failed}{}", failure.message));
-        self.outcome.failures.push((index, failure));
+        self.progress.failures.push((index, failure));
     }
 }
 
 /// Prints the summary of each node that is no other node's parent.
-fn print_summaries(run: &Run<'_>, outcome: &Outcome) -> anyhow::Result<()> {
+fn print_summaries(run: &Run<'_>, progress: &RunProgress) {
     let plan = run.plan;
     let parents: BTreeSet<usize> = plan.nodes.iter().flat_map(Node::parents).collect();
     for (index, node) in plan.nodes.iter().enumerate() {
         if parents.contains(&index) {
             continue;
         }
-        let record = outcome.records[index]
-            .as_ref()
-            .with_context(|| format!("{} has no record", node.label()))?;
-        let file = run.store.object(&record.output).join(SUMMARY_FILE);
-        if let Some(summary) =
-            record.summary.clone().or_else(|| std::fs::read_to_string(&file).ok())
+        let Some(record) = &progress.records[index] else { continue };
+        let recorded = record.summary.clone();
+        if let Some(summary) = recorded.or_else(|| read_summary(&run.store.object(&record.output)))
         {
             print_lines(&format!("{}: {summary}", node.label()));
         }
     }
-    Ok(())
 }

@@ -3,19 +3,18 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use artifact::{format_duration, hash_json, unix_time};
 use planning::stage_call::{Call, Display, StageDisplay, StageFailure, Usage, read_summary};
 use planning::{HashedInputs, Node, Origin, hash_inputs, short_hash, stored_inputs};
 use serde_json::{Map, Value};
-use store::{Attempt, Entered, Holder, KeyLock, Record, Store, TimeSpent, Unfinished, host_name};
+use store::{Attempt, Entered, KeyLock, Record, Store, TimeSpent, Unfinished, host_name};
 
 use crate::estimates::{Estimate, comparison_text};
-use crate::failure;
 use crate::session::Run;
-use crate::unchanged::{ConfirmedProgram, Inputs, input_failure};
-use crate::waiting::{enter_store, holder_text, wait_for_lock};
+use crate::unchanged::{Inputs, call_confirmed};
+use crate::waiting::{enter_store, wait_for_lock};
 use crate::watch::{Chain, Watch, Watching, scratch_name};
 
 /// Action of a node that isn't cached.
@@ -42,30 +41,22 @@ pub(crate) struct NodeJob<'a> {
     /// Expected cost.
     pub(crate) estimate: Option<Estimate>,
     /// Stages that render and score the node's checkpoints, if the node is watched.
-    pub(crate) watch: Option<(&'a Watch, Chain)>,
+    pub(crate) watch: Option<(&'a Watch, Chain<'a>)>,
 }
 
 impl NodeJob<'_> {
-    /// Returns the node's record, after running the node if it isn't cached.
-    pub(crate) fn find_or_run(&self) -> Result<Record, StageFailure> {
-        match self.look_up()? {
-            Lookup::Cached(record) => Ok(record),
-            Lookup::Pending(pending) => self.carry_out(pending).map(|(record, _)| record),
-        }
-    }
-
     /// Looks up the node's record. Cached or not, the node's key is first written to the run's
     /// file, which protects the artifact from garbage collection.
-    pub(crate) fn look_up(&self) -> Result<Lookup, StageFailure> {
+    pub(crate) fn look_up(&self) -> anyhow::Result<Lookup> {
         let inputs = hash_inputs(self.node, self.run.store, Some(self.run.stop), |index| {
             self.output_of(index)
-        })
-        .map_err(|e| input_failure(&e))?;
-        let key_parts = planning::key_parts(self.node, &inputs.hashes, self.device());
+        })?;
+        let key_parts =
+            planning::key_parts(self.node, &inputs.hashes, self.run.plan.device(&self.node.stage));
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
-        self.run.file.record_action(&entered, &self.node.stage, &key).map_err(failure)?;
-        Ok(match self.run.store.hit(&key).map_err(failure)? {
+        self.run.file.record_action(&entered, &self.node.stage, &key)?;
+        Ok(match self.run.store.hit(&key)? {
             Some(record) => Lookup::Cached(record),
             None => Lookup::Pending(PendingAction { key, key_parts, inputs }),
         })
@@ -73,14 +64,13 @@ impl NodeJob<'_> {
 
     /// Runs the node unless another runner has done so meanwhile. Returns the record and whether
     /// the stage ran.
-    pub(crate) fn carry_out(&self, pending: PendingAction) -> Result<(Record, bool), StageFailure> {
+    pub(crate) fn carry_out(&self, pending: PendingAction) -> anyhow::Result<(Record, bool)> {
         let PendingAction { key, key_parts, inputs } = pending;
-        let lock = wait_for_lock(
-            self.run.stop,
-            &|holder, waited| self.report_waiting(holder, waited),
-            || self.run.store.try_lock(&key),
-        )?;
-        let stored = stored_inputs([self.node], self.run.store).map_err(failure)?;
+        let report = |text: &str| self.report(text);
+        let lock = wait_for_lock(self.run.stop, "is being created", &report, || {
+            self.run.store.try_lock(&key)
+        })?;
+        let stored = stored_inputs([self.node], self.run.store)?;
         let action = Unfinished {
             stage: self.node.stage.clone(),
             point: self.node.point.clone(),
@@ -91,11 +81,11 @@ impl NodeJob<'_> {
         let attempt = {
             let entered = self.enter()?;
             let kind = &self.node.program.description.output.kind;
-            let record = self.run.store.hit_or_repair(&entered, &key, kind).map_err(failure)?;
+            let record = self.run.store.hit_or_repair(&entered, &key, kind)?;
             if let Some(record) = record {
                 return Ok((record, false));
             }
-            self.run.store.begin(&entered, &action, &self.node.parameters).map_err(failure)?
+            self.run.store.begin(&entered, &action, &self.node.parameters)?
         };
         let inputs = Inputs::new(self.node, self.run.store, inputs, |index| self.output_of(index))?;
         self.run_and_publish(&lock, attempt, action, &inputs).map(|record| (record, true))
@@ -105,21 +95,12 @@ impl NodeJob<'_> {
         self.parents[&index].output.clone()
     }
 
-    fn device(&self) -> &str {
-        self.run.plan.device(&self.node.stage)
-    }
-
     fn report(&self, text: &str) {
         self.display.line(&format!("{}: {text}", self.node.label()));
     }
 
-    fn enter(&self) -> Result<Entered, StageFailure> {
+    fn enter(&self) -> anyhow::Result<Entered> {
         enter_store(self.run.store, self.run.stop, &|text| self.report(text))
-    }
-
-    fn report_waiting(&self, holder: Option<&Holder>, waited: Duration) {
-        let waited = format_duration(waited.as_secs_f64());
-        self.report(&format!("is being created{}; waiting ({waited} so far)", holder_text(holder)));
     }
 
     /// Calls the stage and publishes its artifact.
@@ -129,8 +110,12 @@ impl NodeJob<'_> {
         attempt: Attempt,
         action: Unfinished,
         inputs: &Inputs<'_>,
-    ) -> Result<Record, StageFailure> {
-        let (peak_memory, time) = self.call(lock, &attempt, inputs)?;
+    ) -> anyhow::Result<Record> {
+        let store = self.run.store;
+        let (peak_memory, time) = call_confirmed(&self.node.program, store, self.run.stop, || {
+            self.call(lock, &attempt, inputs)
+        })?;
+        inputs.check_again(&attempt)?;
         let record = Record {
             stage: action.stage,
             point: action.point,
@@ -147,8 +132,8 @@ impl NodeJob<'_> {
             summary: read_summary(&attempt.output),
         };
         let kind = &self.node.program.description.output.kind;
-        let checked = self.run.store.check(attempt, kind).map_err(failure)?;
-        let record = self.run.store.publish(&self.enter()?, checked, record).map_err(failure)?;
+        let checked = store.check(attempt, kind)?;
+        let record = store.publish(&self.enter()?, checked, record)?;
         let estimate = self.estimate.and_then(|estimate| comparison_text(&estimate, &record));
         self.report(&format!(
             "done in {}, artifact {}{}",
@@ -160,18 +145,16 @@ impl NodeJob<'_> {
     }
 
     /// Calls the stage. Returns its peak memory, and the time of the call and of the calls whose
-    /// checkpoints it resumed from. Fails if the program or an input differs from the one in the
-    /// key, before or after the call.
+    /// checkpoints it resumed from. Fails if an input differs from the one in the key.
     fn call(
         &self,
         lock: &KeyLock,
         attempt: &Attempt,
         inputs: &Inputs<'_>,
-    ) -> Result<(u64, TimeSpent), StageFailure> {
+    ) -> anyhow::Result<(u64, TimeSpent)> {
         let label = self.node.label();
-        let program = ConfirmedProgram::new(&self.node.program, self.run.store, self.run.stop)?;
         inputs.check(self.run.stop)?;
-        if inputs.drop_doubtful_checkpoints(attempt).map_err(failure)? {
+        if inputs.drop_doubtful_checkpoints(attempt)? {
             self.report("an input was written to after the checkpoint; starting over");
         }
         let mut folders: Vec<(String, PathBuf)> = Vec::new();
@@ -190,7 +173,7 @@ impl NodeJob<'_> {
             output: &attempt.output,
             work: Some(&attempt.work),
             from_checkpoint: false,
-            device: self.device(),
+            device: self.run.plan.device(&self.node.stage),
             threads: self.threads,
             lock: Some(&lock.file),
         };
@@ -206,8 +189,6 @@ impl NodeJob<'_> {
         // Without the file, only the record's time is too short.
         attempt.record_time_spent(&time).ok();
         result?;
-        program.confirm_again()?;
-        inputs.check_again(attempt)?;
         Ok((usage.peak_memory, time))
     }
 

@@ -1,6 +1,7 @@
 //! The Slurm executor: submits a job for each node that isn't cached and for each sink, then exits
 //! (docs/design/032).
 
+use std::fs::{self, File};
 use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::Ordering;
@@ -10,13 +11,12 @@ use artifact::{Failure, format_count, hash_json, print_line, report_line};
 use planning::{FrozenPlan, PlanError, Sink, State};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, SubmitOptions, Submitted, Task};
-use store::Record;
 
-use super::Executor;
-use crate::identities::node_identities;
 use crate::run_messages;
-use crate::session::{Run, check_utf8_path};
+use crate::run_record::RunProgress;
+use crate::session::{Run, check_utf8_path, node_identities};
 use crate::sink::{is_up_to_date, sink_parts};
+use crate::waiting::lock_file;
 
 /// The verb that a job calls.
 pub(crate) const JOB_VERB: &str = "job";
@@ -26,8 +26,9 @@ pub(crate) struct Cluster {
     pub(crate) site: Site,
 }
 
-impl Executor for Cluster {
-    fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
+impl Cluster {
+    /// Submits jobs for missing nodes and sinks. Returns the run's exit code.
+    pub(crate) fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
         let root = run.store.root();
         let out = std::path::absolute(run.out)?;
         check_utf8_path("the folder of pages", &out)?;
@@ -49,12 +50,13 @@ impl Executor for Cluster {
             working_folder: &std::env::current_dir()?,
             is_stopped: &|| run.stop.load(Ordering::Relaxed),
         };
+        let lock = slurm::lock_path(root);
+        fs::create_dir_all(root.join("slurm")).with_context(|| lock.display().to_string())?;
+        let _lock = lock_file(&lock, File::options().create(true).append(true), run.stop)?;
         let submitted = submission.submit(root, &options, || find_done(run, &out))?;
         self.report(run, &submission, &submitted)
     }
-}
 
-impl Cluster {
     /// Prints what was submitted and returns the exit code.
     fn report(
         &self,
@@ -94,36 +96,29 @@ impl Cluster {
 fn tasks(run: &Run<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
     let plan = run.plan;
     let identities = node_identities(plan, run.store, Some(run.stop))?;
-    let mut tasks = Vec::with_capacity(plan.nodes.len() + plan.sinks.len());
-    for (index, node) in plan.nodes.iter().enumerate() {
-        tasks.push(Task {
-            stage: node.stage.clone(),
-            label: node.label(),
-            identity: identities[index].clone(),
-            parents: node.parents().collect(),
-            resources: plan.resources.get(&node.stage).cloned().unwrap_or_default(),
-        });
-    }
-    for sink in &plan.sinks {
-        tasks.push(Task {
-            stage: sink.stage.clone(),
-            label: sink.stage.clone(),
-            identity: sink_identity(sink, &identities, out),
-            parents: sink.nodes().into_iter().collect(),
-            resources: plan.resources.get(&sink.stage).cloned().unwrap_or_default(),
-        });
-    }
-    Ok(tasks)
+    let task = |stage: &str, label: String, identity: String, parents: Vec<usize>| Task {
+        stage: stage.to_owned(),
+        label,
+        identity,
+        parents,
+        resources: plan.resources.get(stage).cloned().unwrap_or_default(),
+    };
+    let nodes = plan.nodes.iter().zip(&identities).map(|(node, identity)| {
+        task(&node.stage, node.label(), identity.clone(), node.parents().collect())
+    });
+    let sinks = plan.sinks.iter().map(|sink| {
+        let identity = sink_identity(sink, &identities, out);
+        task(&sink.stage, sink.stage.clone(), identity, sink.nodes().into_iter().collect())
+    });
+    Ok(nodes.chain(sinks).collect())
 }
 
 fn sink_identity(sink: &Sink, node_identities: &[String], out: &Path) -> String {
     let shows: Vec<&String> =
         sink.nodes().into_iter().map(|index| &node_identities[index]).collect();
     let mut parts = sink_parts(sink);
-    for (name, value) in [("sink", json!(sink.stage)), ("shows", json!(shows)), ("out", json!(out))]
-    {
-        parts.insert(name.to_owned(), value);
-    }
+    let own = [("sink", json!(sink.stage)), ("shows", json!(shows)), ("out", json!(out))];
+    parts.extend(own.map(|(name, value)| (name.to_owned(), value)));
     hash_json(&parts)
 }
 
@@ -131,8 +126,9 @@ fn sink_identity(sink: &Sink, node_identities: &[String], out: &Path) -> String 
 fn find_done(run: &Run<'_>, out: &Path) -> anyhow::Result<Vec<bool>> {
     let run = Run { out, ..*run };
     let states = run.plan.states(run.store, Some(run.stop))?;
-    let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
-    let mut done: Vec<bool> = records.iter().map(Option::is_some).collect();
-    done.extend(run.plan.sinks.iter().map(|sink| is_up_to_date(&run, sink, &records)));
+    let records = states.into_iter().map(State::into_record).collect();
+    let progress = RunProgress { records, ..RunProgress::default() };
+    let mut done: Vec<bool> = progress.records.iter().map(Option::is_some).collect();
+    done.extend(run.plan.sinks.iter().map(|sink| is_up_to_date(&run, sink, &progress)));
     Ok(done)
 }

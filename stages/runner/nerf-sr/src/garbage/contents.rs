@@ -1,7 +1,9 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use artifact::Damage;
 use store::{Record, Store, StoreError, Unfinished};
+
+use crate::garbage::roots::Root;
 
 /// Records, objects and unfinished actions of a store.
 pub(crate) struct Contents {
@@ -15,6 +17,16 @@ pub(crate) struct Contents {
     pub(crate) leftover_partials: Vec<String>,
     /// Unfinished actions by key; `None` if the action's description is missing.
     pub(crate) unfinished: BTreeMap<String, Option<Unfinished>>,
+}
+
+/// Entries of a store that some root reaches, each with a reason: the reason of the first root
+/// that reaches it, or `input of STAGE`.
+#[derive(Debug, Default)]
+pub(crate) struct Kept {
+    /// Reasons by the key of an action with a record, or of an unfinished one.
+    pub(crate) actions: BTreeMap<String, String>,
+    /// Reasons by identity (content hash).
+    pub(crate) objects: BTreeMap<String, String>,
 }
 
 impl Contents {
@@ -40,6 +52,47 @@ impl Contents {
             unfinished.insert(key, action);
         }
         Ok(Self { records, action_keys, objects, leftover_partials, unfinished })
+    }
+
+    /// Marks the actions of all roots and, for roots `with_inputs`, the actions that produced their
+    /// inputs.
+    pub(crate) fn reach(&self, roots: &[Root]) -> Kept {
+        let mut kept = Kept::default();
+        for root in roots {
+            let is_waiting = |record: &Record| root.waiting.iter().any(|node| node.matches(record));
+            let matching = self.records.iter().filter(|(_, record)| is_waiting(record));
+            let keys = root.keys.iter().chain(matching.map(|(key, _)| key));
+            let mut to_visit: Vec<(String, String)> =
+                keys.map(|key| (key.clone(), root.reason.clone())).collect();
+            let mut seen = BTreeSet::new();
+            while let Some((key, reason)) = to_visit.pop() {
+                if !seen.insert(key.clone()) {
+                    continue;
+                }
+                if root.with_inputs {
+                    to_visit.extend(self.input_actions(&key));
+                }
+                if let Some(record) = self.records.get(&key) {
+                    kept.objects.entry(record.output.clone()).or_insert_with(|| reason.clone());
+                } else if !self.unfinished.contains_key(&key) {
+                    continue;
+                }
+                kept.actions.entry(key).or_insert(reason);
+            }
+        }
+        kept
+    }
+
+    /// Returns the actions that produced an action's inputs, each with the reason for keeping it.
+    fn input_actions(&self, key: &str) -> Vec<(String, String)> {
+        let record = self.records.get(key).map(|record| (&record.stage, &record.made_of));
+        let unfinished = self.unfinished.get(key).and_then(Option::as_ref);
+        let unfinished = unfinished.map(|action| (&action.stage, &action.made_of));
+        let mut actions = Vec::new();
+        for (stage, made_of) in record.into_iter().chain(unfinished) {
+            actions.extend(made_of.iter().map(|key| (key.clone(), format!("input of {stage}"))));
+        }
+        actions
     }
 }
 

@@ -8,23 +8,22 @@
 //! * [`Root`]: actions that are needed, and why. `roots` collects pins, held locks, unfinished
 //!   actions with a checkpoint, the plan, and runs that are recent or in progress. Submissions with
 //!   jobs are roots, too; if the cluster doesn't answer, all submissions are.
-//! * `contents`: records, objects and unfinished actions of the store.
-//! * `reach`: marks the actions of all roots, and their inputs.
+//! * `contents`: records, objects and unfinished actions of the store, and those that roots reach.
 
 mod contents;
-mod reach;
 mod roots;
 
 use std::collections::BTreeMap;
 
-use artifact::{label, unix_time};
+use artifact::label;
+use planning::short_hash;
 use serde::Serialize;
 use store::{Closed, Record, Store, StoreError};
 
 pub(crate) use roots::{Policy, Root};
 
-use contents::Contents;
-use reach::Kept;
+use crate::planned::age_text;
+use contents::{Contents, Kept};
 
 /// A garbage collection that is decided, but not carried out yet.
 pub(crate) struct Collection {
@@ -42,18 +41,8 @@ impl Collection {
     /// pin is damaged: artifacts that it needs are unknown then.
     pub(crate) fn new(store: &Store, plan: Root, policy: Policy) -> Result<Self, StoreError> {
         let contents = Contents::read(store)?;
-        let runs = store.runs()?;
-        // Submissions are read after the runs: if a run submits jobs and ends between the two
-        // reads, its jobs are found.
-        let submissions = roots::outstanding_submissions(store)?;
-        let roots = roots::find_roots(store, &contents, plan, policy, &runs, &submissions)?;
-        let kept = reach::reach(&contents, &roots);
-        let is_old = |run: &&store::Run| {
-            !run.in_progress
-                && !submissions.contains_key(&run.id)
-                && !policy.is_recent(run.last_used_unix())
-        };
-        let old_runs = runs.iter().filter(is_old).map(|run| run.id.clone()).collect();
+        let (roots, old_runs) = roots::find_roots(store, &contents, plan, policy)?;
+        let kept = contents.reach(&roots);
         Ok(Self { contents, kept, old_runs })
     }
 
@@ -78,44 +67,31 @@ impl Collection {
             bytes: None,
             stage: action.as_ref().map(|action| action.stage.clone()),
             started_unix: action.as_ref().map(|action| action.started_unix),
-            kept_because: self.kept.unfinished.get(key).cloned(),
+            kept_because: self.kept.actions.get(key).cloned(),
         });
         objects.chain(unfinished).collect()
-    }
-
-    /// Returns the total size of objects to delete and of objects to keep, in bytes.
-    pub(crate) fn bytes(&self) -> (u64, u64) {
-        let (mut deleted, mut kept) = (0, 0);
-        for (identity, bytes) in &self.contents.objects {
-            let total =
-                if self.kept.objects.contains_key(identity) { &mut kept } else { &mut deleted };
-            *total += bytes;
-        }
-        (deleted, kept)
     }
 
     /// Moves garbage to the store's trash: records first, so that no record names a missing object.
     /// The store must be closed meanwhile. [`Store::empty_trash`] can run after it is open again.
     pub(crate) fn carry_out(&self, store: &Store, closed: &Closed) -> Result<(), StoreError> {
         let Self { contents, kept, old_runs } = self;
-        for key in contents.action_keys.iter().filter(|key| !kept.records.contains_key(*key)) {
+        let is_garbage = |key: &&String| !kept.actions.contains_key(*key);
+        for key in contents.action_keys.iter().filter(is_garbage) {
             store.remove_record(key)?;
         }
         for identity in contents.objects.keys().filter(|id| !kept.objects.contains_key(*id)) {
             store.remove_object(identity)?;
         }
-        let unfinished = contents.unfinished.keys();
-        let garbage = unfinished.filter(|key| !kept.unfinished.contains_key(*key));
-        for key in garbage.chain(&contents.leftover_partials) {
+        let unfinished = contents.unfinished.keys().filter(is_garbage);
+        for key in unfinished.chain(&contents.leftover_partials) {
             store.remove_partial(key)?;
         }
         for run in old_runs {
             store.remove_run(run)?;
         }
-        for key in store.lock_files()? {
-            if !kept.records.contains_key(&key) && !kept.unfinished.contains_key(&key) {
-                store.remove_lock(&key)?;
-            }
+        for key in store.lock_files()?.iter().filter(is_garbage) {
+            store.remove_lock(key)?;
         }
         store.remove_leftovers(closed)
     }
@@ -127,13 +103,13 @@ pub(crate) struct Decision {
     /// Identity of the artifact, or key of the action.
     hash: String,
     /// Size of the artifact; `None` for an unfinished action.
-    bytes: Option<u64>,
+    pub(crate) bytes: Option<u64>,
     /// Stage and point that created the artifact; stage of an unfinished action.
     stage: Option<String>,
     started_unix: Option<u64>,
     /// Reason for keeping it; `None` if it is to be deleted.
     #[serde(rename = "stays")]
-    kept_because: Option<String>,
+    pub(crate) kept_because: Option<String>,
 }
 
 impl std::fmt::Display for Decision {
@@ -142,14 +118,13 @@ impl std::fmt::Display for Decision {
             Some(reason) => format!("keep: {reason}"),
             None => "delete".to_owned(),
         };
-        let hash = self.hash.get(..10).unwrap_or(&self.hash);
+        let hash = short_hash(&self.hash);
         let Some(bytes) = self.bytes else {
             let stage = self.stage.as_deref().unwrap_or("unknown action");
             return write!(f, "{hash}  unfinished    {stage}: {decision}");
         };
-        let hours = self.started_unix.map(|unix| unix_time().saturating_sub(unix) / 3600);
-        let maker = match (&self.stage, hours) {
-            (Some(stage), Some(hours)) => format!("{stage}, {hours} h old"),
+        let maker = match (&self.stage, self.started_unix) {
+            (Some(stage), Some(unix)) => format!("{stage}, created {}", age_text(unix)),
             _ => "no record names it".to_owned(),
         };
         write!(f, "{hash}  {:>9.1} MB  {maker}: {decision}", bytes as f64 / 1e6)

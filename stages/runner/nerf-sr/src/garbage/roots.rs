@@ -5,6 +5,7 @@ use slurm::{Queue, Slurm};
 use store::{PartialKey, Run, Store, StoreError};
 
 use crate::garbage::contents::Contents;
+use crate::planned::age_text;
 
 /// Actions to keep, with the reason.
 #[derive(Debug, Clone, Default)]
@@ -20,14 +21,17 @@ pub(crate) struct Root {
     pub(crate) with_inputs: bool,
 }
 
-/// Choices of the caller: ages and kinds of entries to keep.
-#[derive(Debug, Clone, Copy)]
+// Choices of the caller: ages and kinds of entries to keep. Doc comments are the options' help.
+#[derive(Debug, Clone, Copy, clap::Args)]
 pub(crate) struct Policy {
-    /// Age, in days since the last use, below which an entry is kept.
+    /// Keep artifacts that were created or used in the last N days
+    #[arg(long, default_value_t = 7, value_name = "N")]
     pub(crate) keep_days: u64,
-    /// True to delete checkpoints of actions that no process is working on.
+    /// Delete checkpoints of interrupted stages, too
+    #[arg(long)]
     pub(crate) drop_unfinished: bool,
-    /// True to delete artifacts whose keys have an older version.
+    /// Delete artifacts of older versions of nerf-sr, too; no plan can use them any more
+    #[arg(long)]
     pub(crate) drop_old: bool,
 }
 
@@ -39,36 +43,43 @@ impl Policy {
     }
 }
 
-/// Returns all roots of a store. If several roots reach an entry, the first one gives the reason.
+/// Returns all roots of a store, and the IDs of runs that are none. If several roots reach an
+/// entry, the first one gives the reason.
 pub(crate) fn find_roots(
     store: &Store,
     contents: &Contents,
     plan: Root,
     policy: Policy,
-    runs: &[Run],
-    submissions: &BTreeMap<String, String>,
-) -> Result<Vec<Root>, StoreError> {
-    let mut roots = vec![plan];
+) -> Result<(Vec<Root>, Vec<String>), StoreError> {
+    let (mut roots, mut old_runs) = (vec![plan], Vec::new());
     for pin in store.pins()? {
         roots.push(run_root(format!("pinned as {}", pin.id), pin));
     }
-    for run in runs.iter().cloned() {
-        if let Some(reason) = submissions.get(&run.id) {
-            roots.push(run_root(reason.clone(), run));
+    let runs = store.runs()?;
+    // Submissions are read after the runs: if a run submits jobs and ends between the two reads,
+    // its jobs are found.
+    let submissions = outstanding_submissions(store)?;
+    for run in runs {
+        let used_unix = run.last_used_unix();
+        let reason = if let Some(reason) = submissions.get(&run.id) {
+            reason.clone()
         } else if run.in_progress {
             let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
-            roots.push(run_root(format!("needed by the run of process {process}"), run));
-        } else if policy.is_recent(run.last_used_unix()) {
-            roots
-                .push(run_root(format!("used by a run {}", format_age(run.last_used_unix())), run));
-        }
+            format!("needed by the run of process {process}")
+        } else if policy.is_recent(used_unix) {
+            format!("used by a run {}", age_text(used_unix))
+        } else {
+            old_runs.push(run.id);
+            continue;
+        };
+        roots.push(run_root(reason, run));
     }
     for key in store.locked_keys()? {
         roots.push(action_root("a stage is creating it".to_owned(), &key));
     }
     for (key, record) in &contents.records {
         if policy.is_recent(record.started_unix) {
-            let reason = format!("created {}", format_age(record.started_unix));
+            let reason = format!("created {}", age_text(record.started_unix));
             roots.push(action_root(reason, key));
         }
         if !policy.drop_old && record.has_old_key() {
@@ -84,14 +95,12 @@ pub(crate) fn find_roots(
             }
         }
     }
-    Ok(roots)
+    Ok((roots, old_runs))
 }
 
 /// Returns the ids of submissions with unfinished jobs, each with the reason for keeping it; all
 /// submissions if Slurm doesn't answer.
-pub(crate) fn outstanding_submissions(
-    store: &Store,
-) -> Result<BTreeMap<String, String>, StoreError> {
+fn outstanding_submissions(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
     let (reason, ids) = match Queue::read(&Slurm::default(), store.root()) {
         Ok(queue) => (
             "a submitted job needs it".to_owned(),
@@ -114,9 +123,4 @@ fn action_root(reason: String, key: &str) -> Root {
 
 fn run_root(reason: String, run: Run) -> Root {
     Root { reason, keys: run.keys, waiting: run.waiting, with_inputs: false }
-}
-
-fn format_age(unix: u64) -> String {
-    let hours = unix_time().saturating_sub(unix) / 3600;
-    if hours < 48 { format!("{hours} h ago") } else { format!("{} days ago", hours / 24) }
 }

@@ -31,9 +31,12 @@ const TARGETS: &[(&str, &str, &str)] = include!(concat!(env!("OUT_DIR"), "/targe
 /// Pipeline for a data set, not written yet.
 #[derive(Clone, Debug)]
 pub(crate) struct Starter {
-    summary: String,
-    sizes: String,
-    notes: Vec<String>,
+    /// Format of the data set, and number and size of its photographs.
+    pub(crate) summary: String,
+    /// Widths of photographs, training images and views as text.
+    pub(crate) sizes: String,
+    /// Notes of the data set, such as lens distortion, one line each.
+    pub(crate) notes: Vec<String>,
     text: String,
     /// Path of the data set as YAML.
     dataset: String,
@@ -52,21 +55,6 @@ impl Starter {
         let (summary, sizes) = (summarize(&set), sizes(&set));
         let text = pipeline_text(&set, &format!("{summary}\n# {sizes}"), &dataset);
         Ok(Self { summary, sizes, notes: set.notes, text, dataset, file: file.to_path_buf() })
-    }
-
-    /// Returns the format of the data set, and number and size of its photographs.
-    pub(crate) fn summary(&self) -> &str {
-        &self.summary
-    }
-
-    /// Returns the widths of photographs, training images and views as text.
-    pub(crate) fn sizes(&self) -> &str {
-        &self.sizes
-    }
-
-    /// Returns the data set's notes, such as lens distortion, one line each.
-    pub(crate) fn notes(&self) -> &[String] {
-        &self.notes
     }
 
     /// Writes the pipeline file and, in folders next to it, the shipped targets. Returns the
@@ -159,25 +147,28 @@ fn common_size(set: &Dataset) -> Option<(u32, u32)> {
 /// with `lr_source=photographs`.
 fn sizes(set: &Dataset) -> String {
     let size = common_size(set);
-    let photographs = match size {
-        Some((width, height)) => format!("photographs {width}×{height}"),
-        None => "photographs of several sizes".to_owned(),
-    };
-    let unshrunk_views = match size {
-        Some((width, _)) => format!("views at {}", width * SCALE),
-        None => format!("views {SCALE} times as wide as each photograph"),
+    let (photographs, unshrunk_views) = match size {
+        Some((width, height)) => {
+            (format!("photographs {width}×{height}"), format!("views at {}", width * SCALE))
+        }
+        None => (
+            "photographs of several sizes".to_owned(),
+            format!("views {SCALE} times as wide as each photograph"),
+        ),
     };
     let training = match (ImageSource::of(set), size) {
-        (ImageSource::Shrunk, _) => Some((MAX_WIDTH / SCALE, MAX_WIDTH)),
-        (ImageSource::Benchmark, Some((width, _))) => Some((width / SCALE, width)),
-        (ImageSource::Benchmark, None) => None,
+        (ImageSource::Shrunk, _) => {
+            format!("training at {}, views at {MAX_WIDTH}", MAX_WIDTH / SCALE)
+        }
+        (ImageSource::Benchmark, Some((width, _))) => {
+            format!("training at {}, views at {width}", width / SCALE)
+        }
+        (ImageSource::Benchmark, None) => {
+            format!("training at 1/{SCALE} of this size, views at this size")
+        }
         (ImageSource::Photographs, _) => {
             return format!("{photographs}; training at this size, {unshrunk_views}");
         }
-    };
-    let training = match training {
-        Some((training, views)) => format!("training at {training}, views at {views}"),
-        None => format!("training at 1/{SCALE} of this size, views at this size"),
     };
     format!("{photographs}; {training}; `-p lr_source=photographs` gives {unshrunk_views}")
 }
@@ -257,10 +248,9 @@ fn image_parameters(set: &Dataset) -> String {
 /// Converts an error of the data set's reader: if the folder contains images, the message names the
 /// command that estimates their cameras.
 fn read_failure(folder: &Path, error: &DatasetError) -> Failure {
-    let images = UnposedImages::find(folder);
-    if !matches!(error, DatasetError::Unrecognised(_)) || images.files.is_empty() {
-        return Failure::BadInput(error.to_string());
-    }
+    let is_unrecognised = matches!(error, DatasetError::Unrecognised(_));
+    let images = UnposedImages::find(folder).filter(|_| is_unrecognised);
+    let Some(images) = images else { return Failure::BadInput(error.to_string()) };
     let remedy = if images.files.len() == 1 {
         "give several photographs, taken from different positions".to_owned()
     } else {

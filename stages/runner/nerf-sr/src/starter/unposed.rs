@@ -18,14 +18,12 @@ pub(crate) struct UnposedImages {
 }
 
 impl UnposedImages {
-    pub(crate) fn find(folder: &Path) -> Self {
-        for subfolder in FOLDERS {
-            let files = list_images(&folder.join(subfolder));
-            if !files.is_empty() {
-                return Self { files, subfolder };
-            }
-        }
-        Self { files: Vec::new(), subfolder: "" }
+    /// Finds the images of a folder; `None` if there are none.
+    pub(crate) fn find(folder: &Path) -> Option<Self> {
+        FOLDERS
+            .iter()
+            .map(|subfolder| Self { files: list_images(&folder.join(subfolder)), subfolder })
+            .find(|images| !images.files.is_empty())
     }
 
     /// Returns the number of images as text, with the command that converts images of unsupported

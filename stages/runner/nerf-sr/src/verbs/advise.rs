@@ -1,24 +1,26 @@
 //! `advise` estimates time and memory of each quality.
 
-use std::process::ExitCode;
-
 use artifact::{format_count, format_duration, format_size, print_line};
-use planning::{Node, Plan, Quality, Request};
+use planning::{Plan, Quality, Request};
 use slurm::Memory;
 
-use crate::estimates::Estimates;
+use crate::estimates::{Estimate, Estimates};
 use crate::run_messages::command_text;
 use crate::session::Session;
-use crate::state_text::processors_text;
 
 /// Target that refines views, in a project's pipelines/.
 const REFINING_TARGET: &str = "refined";
 
-/// Limits within which a quality is chosen.
-#[derive(Clone, Copy, Debug)]
+// Limits within which a quality is chosen. Doc comments are the options' help.
+#[derive(Clone, Copy, Debug, clap::Args)]
 pub(crate) struct Limits {
-    pub(crate) minutes: Option<f64>,
-    pub(crate) memory: Option<Memory>,
+    /// Time that the run may take; the best quality within it is chosen [without a limit:
+    /// balanced]
+    #[arg(long, value_name = "N")]
+    minutes: Option<f64>,
+    /// Memory limit of the run, such as 8G; the best quality whose largest stage fits is chosen
+    #[arg(long, value_name = "AMOUNT")]
+    memory: Option<Memory>,
 }
 
 /// Processor time and memory of some stages.
@@ -57,9 +59,14 @@ const COLUMNS: [(&str, &[&str]); 4] = [
 const REFINING: usize = COLUMNS.len() - 1;
 
 impl Cost {
-    fn add(&mut self, seconds: f64, memory: u64) {
-        self.seconds += seconds;
-        self.memory = self.memory.max(memory);
+    /// Returns the cost of some stages.
+    fn of<'a>(estimates: impl Iterator<Item = &'a Estimate>) -> Self {
+        let mut cost = Self::default();
+        for estimate in estimates {
+            cost.seconds += estimate.processor_seconds;
+            cost.memory = cost.memory.max(estimate.memory);
+        }
+        cost
     }
 
     /// Returns the time on some processors, and the memory.
@@ -79,7 +86,7 @@ pub(crate) fn advise(
     request: &Request,
     limits: Limits,
     arguments: &[String],
-) -> anyhow::Result<ExitCode> {
+) -> anyhow::Result<()> {
     let processors = stage::processors().count;
     let mut all = Vec::new();
     for quality in Quality::ALL {
@@ -87,19 +94,20 @@ pub(crate) fn advise(
     }
     print_table(&all, processors);
     let chosen = choose(&all, limits, processors);
-    let mut words = vec!["run".to_owned()];
-    words.extend(arguments.iter().cloned());
-    words.extend(["-p".to_owned(), format!("quality={}", chosen.quality.name())]);
-    if let Some(memory) = limits.memory.filter(|memory| chosen.min_memory <= memory.bytes()) {
-        words.extend(["--memory".to_owned(), memory.to_string()]);
-    }
-    print_line!("{}", command_text(&words));
-    Ok(ExitCode::SUCCESS)
+    let quality = format!("quality={}", chosen.quality.name());
+    let memory = limits.memory.filter(|memory| chosen.min_memory <= memory.bytes());
+    let memory = memory.map(|memory| memory.to_string());
+    let mut words = vec!["nerf-sr", "run"];
+    words.extend(arguments.iter().map(String::as_str));
+    words.extend(["-p", &quality]);
+    words.extend(memory.iter().flat_map(|memory| ["--memory", memory]));
+    print_line!("{}", command_text(words));
+    Ok(())
 }
 
 fn print_table(all: &[QualityCosts], processors: usize) {
     let columns = COLUMNS.map(|(name, _)| format!("{name:<20}"));
-    let on = processors_text(processors);
+    let on = format_count(processors, "processor");
     print_line!("{:<9} {} in all, on {on}", "quality", columns.join(" "));
     for costs in all {
         let parts = costs.parts.map(|part| format!("{:<20}", part.text(processors)));
@@ -146,36 +154,34 @@ fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> &QualityCo
 fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Result<QualityCosts> {
     let mut request = request.clone();
     request.parameters.push(format!("quality={}", quality.name()));
-    let (plan, states) = session.plan_with_states(&request)?;
-    let estimates = Estimates::new(&plan, &states, &session.store);
+    let planned = session.plan_with_states(&request)?;
+    let estimates = Estimates::new(&planned);
     if quality == Quality::ALL[0] {
         for scene in &estimates.scenes {
             print_line!("{scene}");
         }
     }
-    let mut costs = QualityCosts {
-        quality,
-        parts: [Cost::default(); COLUMNS.len()],
-        total: Cost::default(),
-        min_memory: 0,
-        unknown: estimates.unknown,
-        excludes_refining: false,
-    };
-    for (index, estimate) in estimates.iter() {
-        let program = plan.nodes[index].program.description.name.as_str();
-        costs.total.add(estimate.processor_seconds, estimate.memory);
-        costs.min_memory = costs.min_memory.max(estimate.min_memory);
-        if let Some(column) = COLUMNS.iter().position(|(_, names)| names.contains(&program)) {
-            costs.parts[column].add(estimate.processor_seconds, estimate.memory);
-        }
-    }
-    if costs.parts[REFINING] == Cost::default()
-        && let Some(refining) = refining_cost(session, &request, &plan)
+    let program = |index: &usize| planned.plan.nodes[*index].program.description.name.as_str();
+    let mut parts = COLUMNS.map(|(_, names)| {
+        let of_column = estimates.nodes.iter().filter(|(index, _)| names.contains(&program(index)));
+        Cost::of(of_column.map(|(_, estimate)| estimate))
+    });
+    let mut excludes_refining = false;
+    if parts[REFINING] == Cost::default()
+        && let Some(refining) = refining_cost(session, &request, &planned.plan)
     {
-        costs.parts[REFINING] = refining;
-        costs.excludes_refining = true;
+        parts[REFINING] = refining;
+        excludes_refining = true;
     }
-    Ok(costs)
+    let all = || estimates.nodes.values();
+    Ok(QualityCosts {
+        quality,
+        parts,
+        total: Cost::of(all()),
+        min_memory: all().map(|estimate| estimate.min_memory).max().unwrap_or(0),
+        unknown: estimates.unknown,
+        excludes_refining,
+    })
 }
 
 /// Returns the additional cost of refining the views of a plan; `None` if the request names
@@ -186,18 +192,14 @@ fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Co
     }
     let targets = vec![REFINING_TARGET.to_owned()];
     let request = Request { targets, ..request.clone() };
-    let (refined, refined_states) = session.plan_with_states(&request).ok()?;
-    let estimates = Estimates::new(&refined, &refined_states, &session.store);
-    let mut cost = Cost::default();
-    for (index, estimate) in estimates.iter() {
-        let refined_node = &refined.nodes[index];
-        let is_same =
-            |node: &Node| (&node.stage, &node.point) == (&refined_node.stage, &refined_node.point);
-        if !plan.nodes.iter().any(is_same) {
-            cost.add(estimate.processor_seconds, estimate.memory);
-        }
-    }
-    Some(cost)
+    let refined = session.plan_with_states(&request).ok()?;
+    let estimates = Estimates::new(&refined);
+    let is_new = |index: &usize| {
+        let new = &refined.plan.nodes[*index];
+        !plan.nodes.iter().any(|node| (&node.stage, &node.point) == (&new.stage, &new.point))
+    };
+    let added = estimates.nodes.iter().filter(|(index, _)| is_new(index));
+    Some(Cost::of(added.map(|(_, estimate)| estimate)))
 }
 
 #[cfg(test)]

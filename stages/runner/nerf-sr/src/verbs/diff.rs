@@ -1,4 +1,4 @@
-use std::process::ExitCode;
+use std::collections::BTreeSet;
 
 use artifact::{bail_bad_input, print_line};
 use planning::{Change, PlanError, Request, State};
@@ -14,12 +14,7 @@ const MAX_LISTED_FILES: usize = 4;
 const MIN_HASH_CHARS: usize = 6;
 
 /// Prints the differences between two results and the actions that they depend on.
-pub(crate) fn diff(
-    session: &Session,
-    before: &str,
-    now: &str,
-    json: bool,
-) -> anyhow::Result<ExitCode> {
+pub(crate) fn diff(session: &Session, before: &str, now: &str, json: bool) -> anyhow::Result<()> {
     let (before, now) = (read_side(session, before)?, read_side(session, now)?);
     let differences = now.differences(&before, &session.store)?;
     if json {
@@ -31,7 +26,7 @@ pub(crate) fn diff(
     if differences.is_empty() {
         print_line!("no differences");
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Returns one line per difference of a stage; many files share one line.
@@ -66,7 +61,7 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
                     "several artifacts' hashes begin with this; give more characters",
                 ));
             }
-            return Lineage::read(store, [record.key()]);
+            return Lineage::read(store, BTreeSet::from([record.key()]));
         }
     }
     read_stage(session, text)
@@ -76,15 +71,15 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
 /// plan.
 fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let (stage, request) = stage_request(text)?;
-    let (plan, states) = session.plan_with_states(&request)?;
-    let nodes = nodes_of_stage(&plan, &stage)?;
+    let planned = session.plan_with_states(&request)?;
+    let nodes = nodes_of_stage(&planned.plan, &stage)?;
     let &[index] = nodes.as_slice() else {
         return Err(usage(text, "a sweep has several results; give one value for each parameter"));
     };
-    let State::Cached(record) = &states[index] else {
+    let State::Cached(record) = &planned.states[index] else {
         bail_bad_input!("{text} has no artifact yet; run it first");
     };
-    Lineage::read(&session.store, [record.key()])
+    Lineage::read(&session.store, BTreeSet::from([record.key()]))
 }
 
 /// Parses a stage with the arguments of a plan; words are split as by a POSIX shell.

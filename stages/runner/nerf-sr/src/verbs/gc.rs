@@ -1,10 +1,6 @@
-use std::process::ExitCode;
-use std::time::Duration;
-
 use crate::garbage::{Collection, Policy, Root};
 use anyhow::Context as _;
-use artifact::{Failure, format_duration, format_size, print_line, report_line};
-use planning::stage_call::StageFailure;
+use artifact::{format_size, print_line, report_line};
 use planning::{PlanError, Request, stored_inputs};
 use serde_json::json;
 use stage::stop_on_signals;
@@ -14,74 +10,56 @@ use super::print_json;
 use crate::session::Session;
 use crate::waiting::wait_for_lock;
 
-/// Deletes artifacts that nothing needs (docs/design/029).
+/// Deletes artifacts that nothing needs (docs/design/029), or with `dry_run` only lists them.
 pub(crate) fn gc(
     session: &Session,
     request: &Request,
     policy: Policy,
-    output: GcOutput,
-) -> anyhow::Result<ExitCode> {
+    dry_run: bool,
+    json: bool,
+) -> anyhow::Result<()> {
     let store = &session.store;
     let root = plan_root(session, request)?;
-    if output.dry_run {
-        return output.print(&Collection::new(store, root, policy).context(UNREADABLE)?);
+    if dry_run {
+        return print(&Collection::new(store, root, policy).context(UNREADABLE)?, dry_run, json);
     }
     let stop = stop_on_signals()?;
-    let closed = match wait_for_lock(&stop, &|_, waited| report_wait(waited), || store.try_close())
-    {
-        Ok(closed) => closed,
-        Err(failure) if failure.code == StageFailure::INTERRUPTED => {
-            return Err(Failure::Interrupted.into());
-        }
-        Err(failure) => return Err(failure.into()),
-    };
+    let report = |text: &str| report_line!("nerf-sr: {text}");
+    let closed = wait_for_lock(&stop, "runs look up artifacts", &report, || store.try_close())?;
     let collection = Collection::new(store, root, policy).context(UNREADABLE)?;
     collection.carry_out(store, &closed)?;
     drop(closed);
     if let Err(error) = store.empty_trash() {
         report_line!("nerf-sr: warning: the next gc must delete the rest of the trash: {error}");
     }
-    output.print(&collection)
+    print(&collection, dry_run, json)
 }
 
 /// Context of an error before anything is deleted.
 const UNREADABLE: &str = "nothing was deleted, because gc must read the whole store; make this \
     file readable or move it away";
 
-fn report_wait(waited: Duration) {
-    report_line!(
-        "nerf-sr: waiting for runs that look up artifacts ({} so far)",
-        format_duration(waited.as_secs_f64())
-    );
-}
-
-/// Options of the output of `gc`.
-#[derive(Clone, Copy)]
-pub(crate) struct GcOutput {
-    /// True if nothing is deleted.
-    pub(crate) dry_run: bool,
-    /// True if JSON is printed.
-    pub(crate) json: bool,
-}
-
-impl GcOutput {
-    fn print(self, collection: &Collection) -> anyhow::Result<ExitCode> {
-        let (deleted, kept) = collection.bytes();
-        if self.json {
-            return print_json(&json!({"dry_run": self.dry_run, "bytes_gone": deleted,
-                "bytes_left": kept, "items": collection.decisions()}));
-        }
-        for decision in collection.decisions() {
-            print_line!("{decision}");
-        }
-        let [deleted, kept] = [deleted, kept].map(format_size);
-        if self.dry_run {
-            print_line!("{deleted} would be deleted, {kept} would be kept");
-        } else {
-            print_line!("{deleted} deleted, {kept} kept");
-        }
-        Ok(ExitCode::SUCCESS)
+fn print(collection: &Collection, dry_run: bool, json: bool) -> anyhow::Result<()> {
+    let decisions = collection.decisions();
+    let (mut deleted, mut kept) = (0, 0);
+    for decision in &decisions {
+        let total = if decision.kept_because.is_some() { &mut kept } else { &mut deleted };
+        *total += decision.bytes.unwrap_or(0);
     }
+    if json {
+        return print_json(&json!({"dry_run": dry_run, "bytes_gone": deleted,
+            "bytes_left": kept, "items": decisions}));
+    }
+    for decision in decisions {
+        print_line!("{decision}");
+    }
+    let [deleted, kept] = [deleted, kept].map(format_size);
+    if dry_run {
+        print_line!("{deleted} would be deleted, {kept} would be kept");
+    } else {
+        print_line!("{deleted} deleted, {kept} kept");
+    }
+    Ok(())
 }
 
 /// Returns the root that keeps the plan's actions.

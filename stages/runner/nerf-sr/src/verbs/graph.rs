@@ -1,5 +1,3 @@
-use std::process::ExitCode;
-
 use artifact::print_lines;
 use planning::{Origin, Plan, Request, State};
 
@@ -8,24 +6,20 @@ use crate::session::Session;
 /// Output format of `graph`.
 // Values have no doc comments: clap would give every verb's help its long form.
 #[derive(Clone, Copy, clap::ValueEnum)]
-pub(crate) enum GraphFormat {
+pub(crate) enum Format {
     Text,
     Dot,
 }
 
 /// Draws the plan as text or for Graphviz.
-pub(crate) fn graph(
-    session: &Session,
-    request: &Request,
-    format: GraphFormat,
-) -> anyhow::Result<ExitCode> {
-    let (plan, states) = session.plan_with_states(request)?;
-    let vertices = vertices(&plan, &states);
+pub(crate) fn graph(session: &Session, request: &Request, format: Format) -> anyhow::Result<()> {
+    let planned = session.plan_with_states(request)?;
+    let vertices = vertices(&planned.plan, &planned.states);
     print_lines(&match format {
-        GraphFormat::Text => draw_as_text(&vertices),
-        GraphFormat::Dot => draw_for_graphviz(&vertices),
+        Format::Text => draw_as_text(&vertices),
+        Format::Dot => draw_for_graphviz(&vertices),
     });
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// A node or sink in the graph.
@@ -91,15 +85,10 @@ fn draw_for_graphviz(vertices: &[Vertex]) -> String {
     let mut text = "digraph pipeline {\n  rankdir=LR;\n  node [shape=box];\n".to_owned();
     for (i, vertex) in vertices.iter().enumerate() {
         let shape = if vertex.is_sink { ", shape=note" } else { "" };
-        text += &format!("  n{i} [label={}{shape}];\n", quoted(&vertex.label));
+        text += &format!("  n{i} [label={:?}{shape}];\n", vertex.label);
         for (parent, subtree) in &vertex.parents {
-            text += &format!("  n{parent} -> n{i} [label={}];\n", quoted(subtree));
+            text += &format!("  n{parent} -> n{i} [label={subtree:?}];\n");
         }
     }
     text + "}\n"
-}
-
-/// Quotes a text for Graphviz.
-fn quoted(text: &str) -> String {
-    format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\""))
 }

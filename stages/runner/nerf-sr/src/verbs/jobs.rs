@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
-use artifact::{format_count, print_line, report_line, report_text};
+use artifact::{bail_bad_input, format_count, print_line, report_line};
 use planning::stage_call::{Display, StageFailure, stop_on_signals};
 use planning::{FrozenPlan, Plan, State};
 use signal_hook::consts::SIGUSR1;
@@ -15,15 +15,15 @@ use store::{Record, Store};
 
 use super::run::begin_run;
 use crate::estimates::Estimates;
-use crate::execute::NodeJob;
+use crate::execute::{Lookup, NodeJob};
 use crate::run_record::RunProgress;
 use crate::session::Run;
 use crate::sink::run_sink;
-use crate::unchanged::input_failure;
+use crate::stage_failure;
 
 /// Cancels the jobs of this store, or those of one stage. Slurm also cancels the jobs that depend
 /// on them.
-pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<ExitCode> {
+pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<()> {
     let slurm = Slurm::default();
     let mut jobs = Queue::read(&slurm, store.root())?.jobs;
     jobs.retain(|job| stage.is_none_or(|stage| job.task.stage == stage));
@@ -33,7 +33,7 @@ pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<ExitC
     }
     let of_stage = stage.map(|stage| format!(" of {stage}")).unwrap_or_default();
     print_line!("cancelled {}{of_stage}", format_count(jobs.len(), "job"));
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Runs one task of a submission as a cluster's job: a node whose parents' jobs have ended, or a
@@ -51,29 +51,25 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let frozen = FrozenPlan::read(&Submission::plan_path(folder))?;
     let plan = frozen.task_plan(number)?;
     let result = begin_run(&store, &plan, &stop).and_then(|(file, _)| {
-        let command = submission_command(&store, folder);
+        // The command line of the run that wrote the submission, unless its file was deleted.
+        let id = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let submitting = store.run_or_pin(id).ok().flatten();
+        let command = submitting.map(|run| run.command).unwrap_or_default();
         let (plan, store, out) = (&plan, &store, frozen.out.as_path());
         // No estimates: those of the submitting machine may not be valid on this one.
         let estimates = &Estimates::default();
         let run = Run { plan, store, file: &file, out, estimates, stop: &stop };
-        let result = run_task(&run, &command);
+        let result = run_task(&run, command);
         file.end().ok();
         result
     });
-    let Err(failure) = result else { return Ok(ExitCode::SUCCESS) };
-    report_text(&format!("nerf-sr: {}", failure.message));
-    if is_time_up.load(Ordering::Relaxed) && failure.code == StageFailure::INTERRUPTED {
+    let Err(error) = result else { return Ok(ExitCode::SUCCESS) };
+    let StageFailure { code, message } = stage_failure(&error);
+    report_line!("nerf-sr: {message}");
+    if is_time_up.load(Ordering::Relaxed) && code == StageFailure::INTERRUPTED {
         requeue(&plan, &store)?;
     }
-    Ok(ExitCode::from(failure.code))
-}
-
-/// Returns the command line of the run that wrote a submission; empty if the run's file was
-/// deleted.
-fn submission_command(store: &Store, folder: &Path) -> Vec<String> {
-    let id = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-    let run = store.run_or_pin(id).ok().flatten();
-    run.map(|run| run.command).unwrap_or_default()
+    Ok(ExitCode::from(code))
 }
 
 /// Puts the job back into the queue if its stage has left a checkpoint. Without one, the job would
@@ -98,15 +94,15 @@ fn requeue(plan: &Plan, store: &Store) -> anyhow::Result<()> {
 
 /// Runs the task of a plan for one job. `command` is the command line of the run that submitted the
 /// task.
-fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
-    let states = run.plan.states(run.store, Some(run.stop)).map_err(|e| input_failure(&e))?;
+fn run_task(run: &Run<'_>, command: Vec<String>) -> anyhow::Result<()> {
+    let states = run.plan.states(run.store, Some(run.stop))?;
     let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
     let threads = stage::processors().count;
     stage::start_threads(threads);
     if let Some(sink) = run.plan.sinks.first() {
         check_parents(run.plan, &sink.stage, sink.nodes().into_iter(), &records)?;
-        let progress = RunProgress { command, ..RunProgress::not_started(&records) };
-        run_sink(run, sink, threads, &progress)?.print(&sink.stage);
+        let progress = RunProgress { records, command, ..RunProgress::default() };
+        run_sink(run, sink, threads, &progress)?;
         return Ok(());
     }
     let Some(node) = run.plan.nodes.last() else { return Ok(()) };
@@ -119,7 +115,10 @@ fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
         node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
     let display = &Display::default();
     let job = NodeJob { run, node, parents, threads, display, estimate: None, watch: None };
-    job.find_or_run().map(drop)
+    if let Lookup::Pending(pending) = job.look_up()? {
+        job.carry_out(pending)?;
+    }
+    Ok(())
 }
 
 /// Fails if a parent has no record. A job may start without its parents, because Slurm treats a
@@ -129,14 +128,13 @@ fn check_parents(
     label: &str,
     mut parents: impl Iterator<Item = usize>,
     records: &[Option<Record>],
-) -> Result<(), StageFailure> {
-    let Some(parent) = parents.find(|&parent| records[parent].is_none()) else {
-        return Ok(());
-    };
-    let parent = plan.nodes[parent].label();
-    let message = format!(
-        "{label} needs {parent}, which has no artifact: its job failed, was cancelled, or is \
-        unknown to Slurm; run again"
-    );
-    Err(StageFailure { code: StageFailure::BAD_INPUT, message })
+) -> anyhow::Result<()> {
+    if let Some(parent) = parents.find(|&parent| records[parent].is_none()) {
+        bail_bad_input!(
+            "{label} needs {}, which has no artifact: its job failed, was cancelled, or is unknown \
+            to Slurm; run again",
+            plan.nodes[parent].label()
+        );
+    }
+    Ok(())
 }

@@ -1,5 +1,5 @@
-use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::fs::Metadata;
+use std::path::PathBuf;
 use std::time::UNIX_EPOCH;
 
 use anyhow::Context as _;
@@ -8,47 +8,40 @@ use planning::{Plan, PlanError, Request, State};
 
 use store::{Store, StoreError};
 
-use crate::identities::node_identities;
-use crate::session::{Session, nodes_of_stage};
+use crate::session::{Session, node_identities, nodes_of_stage};
 
 /// Prints the logs of a stage's nodes, or the log of the stage's last run with any arguments.
-pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::Result<ExitCode> {
+pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::Result<()> {
     let plan = session.plan(request)?;
     let nodes = nodes_of_stage(&plan, stage);
     let logs = nodes.as_ref().map_or(Ok(Vec::new()), |nodes| find_logs(session, &plan, nodes))?;
     for log in &logs {
-        log.print()?;
+        print(log)?;
     }
     if !logs.is_empty() {
-        return Ok(ExitCode::SUCCESS);
+        return Ok(());
     }
     let Some((unix, log)) = find_last_log(&session.store, stage)? else {
         // A stage of the plan may not have a log yet; an unknown stage is an error.
         nodes?;
         print_line!("{stage}: has not run yet");
-        return Ok(ExitCode::SUCCESS);
+        return Ok(());
     };
     print_line!(
         "{stage}: no log for these arguments; this is the log of its last run, {}",
         format_utc(unix)
     );
-    log.print()?;
-    Ok(ExitCode::SUCCESS)
+    print(&log)
 }
 
-/// Log of one node.
-struct NodeLog {
-    label: String,
-    path: PathBuf,
-}
+/// Label and path of the log of one node.
+type NodeLog = (String, PathBuf);
 
-impl NodeLog {
-    fn print(&self) -> anyhow::Result<()> {
-        let bytes = std::fs::read(&self.path).with_context(|| self.path.display().to_string())?;
-        print_line!("{} ({}):", self.label, self.path.display());
-        print_lines(&String::from_utf8_lossy(&bytes));
-        Ok(())
-    }
+fn print((label, path): &NodeLog) -> anyhow::Result<()> {
+    let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
+    print_line!("{label} ({}):", path.display());
+    print_lines(&String::from_utf8_lossy(&bytes));
+    Ok(())
 }
 
 /// Finds the existing logs of nodes: for each node, the stage's log and that of the newest job.
@@ -68,7 +61,7 @@ fn find_logs(session: &Session, plan: &Plan, nodes: &[usize]) -> anyhow::Result<
         });
         let job_log = job_logs.get(node).cloned().flatten();
         for path in [stage_log, job_log].into_iter().flatten().filter(|path| path.is_file()) {
-            logs.push(NodeLog { label: plan.nodes[node].label(), path });
+            logs.push((plan.nodes[node].label(), path));
         }
     }
     Ok(logs)
@@ -91,28 +84,22 @@ fn unfinished_log(store: &Store, key: &str) -> PathBuf {
 }
 
 /// Finds the log of a stage's last run, finished or not, with any arguments. Returns the time of
-/// its end or last output, in seconds since 1970, and the log.
+/// its last output, in seconds since 1970, and the log.
 fn find_last_log(store: &Store, stage: &str) -> Result<Option<(u64, NodeLog)>, StoreError> {
-    let mut logs = Vec::new();
-    for record in store.records()?.into_iter().filter(|record| record.stage == stage) {
-        let ended_unix = record.started_unix + record.seconds as u64;
-        let path = store.action(&record.key(), "log");
-        logs.push((ended_unix, NodeLog { label: label(&record.stage, &record.point), path }));
+    let mut actions = Vec::new();
+    for record in store.records()? {
+        actions.push((store.action(&record.key(), "log"), record.stage, record.point));
     }
     for key in store.partials()? {
-        let path = unfinished_log(store, &key);
-        if let Some(action) = store.unfinished(&key)?.filter(|action| action.stage == stage)
-            && let Some(unix) = modified_unix(&path)
-        {
-            logs.push((unix, NodeLog { label: label(&action.stage, &action.point), path }));
+        if let Some(action) = store.unfinished(&key)? {
+            actions.push((unfinished_log(store, &key), action.stage, action.point));
         }
     }
-    logs.retain(|(_, log)| log.path.is_file());
-    Ok(logs.into_iter().max_by_key(|(unix, _)| *unix))
-}
-
-/// Returns a file's modification time in seconds since 1970; `None` if unknown.
-fn modified_unix(path: &Path) -> Option<u64> {
-    let time = std::fs::metadata(path).ok()?.modified().ok()?;
-    Some(time.duration_since(UNIX_EPOCH).ok()?.as_secs())
+    actions.retain(|(_, other, _)| other == stage);
+    let logs = actions.into_iter().filter_map(|(path, stage, point)| {
+        let time = path.metadata().ok().filter(Metadata::is_file)?.modified().ok()?;
+        let unix = time.duration_since(UNIX_EPOCH).ok()?.as_secs();
+        Some((unix, (label(&stage, &point), path)))
+    });
+    Ok(logs.max_by_key(|(unix, _)| *unix))
 }

@@ -1,37 +1,22 @@
 //! The verbs of the command line.
 
-mod advise;
-mod diff;
-mod gc;
-mod graph;
-mod jobs;
-mod log;
-mod path;
-mod pin;
-mod run;
-mod standalone;
-mod states;
-mod verify;
-
-use std::process::ExitCode;
+pub(crate) mod advise;
+pub(crate) mod diff;
+pub(crate) mod gc;
+pub(crate) mod graph;
+pub(crate) mod jobs;
+pub(crate) mod log;
+pub(crate) mod path;
+pub(crate) mod pin;
+pub(crate) mod run;
+pub(crate) mod standalone;
+pub(crate) mod states;
+pub(crate) mod verify;
 
 use serde::Serialize;
 
-pub(crate) use advise::{Limits, advise};
-pub(crate) use diff::diff;
-pub(crate) use gc::{GcOutput, gc};
-pub(crate) use graph::{GraphFormat, graph};
-pub(crate) use jobs::{cancel, job};
-pub(crate) use log::log;
-pub(crate) use path::path;
-pub(crate) use pin::{pin, unpin};
-pub(crate) use run::run;
-pub(crate) use standalone::{completions, describe, init, man};
-pub(crate) use states::{plan, status, why};
-pub(crate) use verify::verify;
-
 /// Prints a value as JSON.
-fn print_json(value: &impl Serialize) -> anyhow::Result<ExitCode> {
+fn print_json(value: &impl Serialize) -> anyhow::Result<()> {
     artifact::print_lines(&serde_json::to_string_pretty(value)?);
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }

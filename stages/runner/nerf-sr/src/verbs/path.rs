@@ -1,22 +1,16 @@
 use std::collections::BTreeSet;
-use std::process::ExitCode;
 
-use artifact::{FailureExt as _, bail_bad_input, print_line, relative_path};
-use planning::{PlanError, Request, State};
+use artifact::{FailureExt as _, bail_bad_input, bail_usage, print_line, relative_path};
+use planning::{Request, State};
 
 use crate::session::{Session, nodes_of_stage};
 
 /// Prints the path of a stage's artifact, or of a folder or file in it, one line per point of a
 /// sweep.
-pub(crate) fn path(
-    session: &Session,
-    stage_path: &str,
-    request: &Request,
-) -> anyhow::Result<ExitCode> {
-    let (stage, inner) = match stage_path.split_once('/') {
-        Some((stage, inner)) => (stage, Some(inner)),
-        None => (stage_path, None),
-    };
+pub(crate) fn path(session: &Session, stage_path: &str, request: &Request) -> anyhow::Result<()> {
+    let (stage, inner) = stage_path
+        .split_once('/')
+        .map_or((stage_path, None), |(stage, inner)| (stage, Some(inner)));
     if let Some(inner) = inner.filter(|inner| !inner.is_empty()) {
         relative_path(inner).usage(stage_path)?;
     }
@@ -24,10 +18,10 @@ pub(crate) fn path(
     if request.targets.is_empty() {
         request.targets.push(stage.to_owned());
     }
-    let (plan, states) = session.plan_with_states(&request)?;
-    for index in nodes_of_stage(&plan, stage)? {
-        let State::Cached(record) = &states[index] else {
-            let label = plan.nodes[index].label();
+    let planned = session.plan_with_states(&request)?;
+    for index in nodes_of_stage(&planned.plan, stage)? {
+        let State::Cached(record) = &planned.states[index] else {
+            let label = planned.plan.nodes[index].label();
             bail_bad_input!("{label} has no artifact yet; run it first");
         };
         let mut path = session.store.object(&record.output);
@@ -40,10 +34,9 @@ pub(crate) fn path(
                 .map(|file| file.path.split('/').next().unwrap_or_default())
                 .collect();
             let known = artifact::known_names(inner.unwrap_or_default(), known);
-            let message = format!("{stage_path}: {stage} has no such folder or file; {known}");
-            return Err(PlanError::Usage(message).into());
+            bail_usage!("{stage_path}: {stage} has no such folder or file; {known}");
         }
         print_line!("{}", path.display());
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }

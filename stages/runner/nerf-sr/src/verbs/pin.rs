@@ -1,7 +1,5 @@
-use std::process::ExitCode;
-
-use artifact::{format_count, known_names, print_line};
-use planning::{PlanError, Request, State, stored_inputs};
+use artifact::{Failure, bail_usage, format_count, known_names, print_line};
+use planning::{Request, State, stored_inputs};
 
 use crate::session::{Session, command_line};
 use crate::waiting::try_enter_store;
@@ -10,7 +8,7 @@ use crate::waiting::try_enter_store;
 const MAX_NAME_BYTES: usize = 100;
 
 /// Protects the targets' artifacts from garbage collection.
-pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::Result<ExitCode> {
+pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::Result<()> {
     check_name(name)?;
     let plan = session.plan(request)?;
     let entered = try_enter_store(&session.store)?;
@@ -18,8 +16,7 @@ pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::R
     for (index, state) in plan.states(&session.store, None)?.into_iter().enumerate() {
         let node = &plan.nodes[index];
         let State::Cached(record) = state else {
-            let message = format!("{} has no artifact to pin yet; run it first", node.label());
-            return Err(PlanError::Usage(message).into());
+            bail_usage!("{} has no artifact to pin yet; run it first", node.label());
         };
         actions.push((node.stage.clone(), record.key()));
     }
@@ -28,29 +25,29 @@ pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::R
     }
     session.store.pin(&entered, name, command_line(), &actions)?;
     print_line!("pinned {} as {name}", format_count(actions.len(), "artifact"));
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Removes a pin.
-pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<ExitCode> {
+pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<()> {
     check_name(name)?;
     if session.store.unpin(name)? {
         print_line!("removed pin {name}");
-        return Ok(ExitCode::SUCCESS);
+        return Ok(());
     }
     let pins = session.store.pin_names()?;
     let known = known_names(name, pins.iter().map(String::as_str));
-    Err(PlanError::Usage(format!("no pin {name:?}; {known}")).into())
+    bail_usage!("no pin {name:?}; {known}");
 }
 
 /// Fails unless a pin's name is valid as a file name.
-fn check_name(name: &str) -> Result<(), PlanError> {
+fn check_name(name: &str) -> Result<(), Failure> {
     let is_plain = name.chars().all(|c| c.is_alphanumeric() || "-_.".contains(c));
     if name.is_empty() || name.starts_with('.') || name.len() > MAX_NAME_BYTES || !is_plain {
-        return Err(PlanError::Usage(format!(
+        bail_usage!(
             "invalid pin name {name:?}; use at most {MAX_NAME_BYTES} bytes of letters, digits, -, \
             _ and ., and no dot at the beginning"
-        )));
+        );
     }
     Ok(())
 }

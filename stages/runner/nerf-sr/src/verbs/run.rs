@@ -1,39 +1,34 @@
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
-use artifact::{Failure, report_line};
-use planning::stage_call::{StageFailure, stop_on_signals};
+use artifact::report_line;
+use planning::stage_call::stop_on_signals;
 use planning::{Describing, Plan, Request, State, stored_inputs};
 use store::{RunFile, Store};
 
 use crate::estimates::Estimates;
-use crate::execute::Executor;
-use crate::failure;
+use crate::planned::Planned;
 use crate::session::{Run, Session, check_not_in_input, command_line};
 use crate::waiting::enter_store;
 
-/// Runs the stages that the targets need, then the sinks.
+/// Runs the stages that the targets need, then the sinks, by `carry_out`.
 pub(crate) fn run(
     session: &Session,
     request: &Request,
     out: &Path,
-    executor: &dyn Executor,
+    carry_out: impl FnOnce(&Run<'_>) -> anyhow::Result<ExitCode>,
 ) -> anyhow::Result<ExitCode> {
     let stop = stop_on_signals()?;
     let plan = session.new_plan(request, Describing::OwnAndNeeded(&stop))?;
     check_not_in_input(&plan, "the folder of pages", out)?;
     plan.check_folders()?;
-    let (file, states) = match begin_run(&session.store, &plan, &stop) {
-        Ok(begun) => begun,
-        // A signal that ends the wait for the store isn't an error of the store.
-        Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),
-        Err(error) => return Err(error.into()),
-    };
+    let (file, states) = begin_run(&session.store, &plan, &stop)?;
     let store = &session.store;
-    let estimates = &Estimates::new(&plan, &states, store);
-    let run = Run { plan: &plan, store, file: &file, out, estimates, stop: &stop };
-    let result = executor.carry_out(&run);
+    let planned = Planned { store, plan, states };
+    let estimates = &Estimates::new(&planned);
+    let run = Run { plan: &planned.plan, store, file: &file, out, estimates, stop: &stop };
+    let result = carry_out(&run);
     // If the end can't be recorded, as on a full disk, the run's age is counted from its start.
     file.end().ok();
     result
@@ -45,20 +40,19 @@ pub(super) fn begin_run(
     store: &Store,
     plan: &Plan,
     stop: &AtomicBool,
-) -> Result<(RunFile, Vec<State>), StageFailure> {
+) -> anyhow::Result<(RunFile, Vec<State>)> {
     let entered = enter_store(store, stop, &|text| report_line!("nerf-sr: {text}"))?;
-    let file = store.begin_run(&entered, command_line()).map_err(failure)?;
+    let file = store.begin_run(&entered, command_line())?;
     // An unreadable input folder is reported when its stage is due: other stages may not need it.
     let states = plan.states(store, Some(stop)).unwrap_or_default();
     for (index, node) in plan.nodes.iter().enumerate() {
         match states.get(index).and_then(State::key) {
             Some(key) => file.record_action(&entered, &node.stage, &key),
             None => file.record_waiting(&entered, node.partial_key()),
-        }
-        .map_err(failure)?;
+        }?;
     }
-    for record in stored_inputs(&plan.nodes, store).map_err(failure)? {
-        file.record_action(&entered, &record.stage, &record.key()).map_err(failure)?;
+    for record in stored_inputs(&plan.nodes, store)? {
+        file.record_action(&entered, &record.stage, &record.key())?;
     }
     Ok((file, states))
 }

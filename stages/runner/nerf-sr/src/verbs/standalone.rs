@@ -7,17 +7,17 @@ use std::process::{Command, ExitCode};
 
 use crate::starter::Starter;
 use anyhow::Context as _;
-use artifact::{format_count, print_line, print_lines};
+use artifact::{bail_usage, format_count, print_line, print_lines};
 use planning::{Describing, Pipeline, PlanError, Programs, executable, is_own, own_program};
 use stage::render_help;
 use store::Store;
 
 /// Writes a pipeline for a folder of posed photographs, and prints what was found.
-pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
+pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<()> {
     let starter = Starter::new(folder, file)?;
-    print_line!("found: {}", starter.summary());
-    print_line!("sizes: {}", starter.sizes());
-    for note in starter.notes() {
+    print_line!("found: {}", starter.summary);
+    print_line!("sizes: {}", starter.sizes);
+    for note in &starter.notes {
         print_line!("  {note}");
     }
     let written = starter.write()?;
@@ -33,7 +33,7 @@ pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
         count("experiments")
     );
     print_line!("`nerf-sr run` renders the views; `nerf-sr plan` shows the stages for this");
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Prints the help of a block's program, or of a program in the runner's folder. A program that
@@ -52,7 +52,7 @@ pub(crate) fn describe(
     let (pipeline, _) = found?;
     if !has_block {
         let known = artifact::known_names(stage, pipeline.stages.keys().map(String::as_str));
-        return Err(PlanError::Usage(format!("no stage {stage:?}; {known}")).into());
+        bail_usage!("no stage {stage:?}; {known}");
     }
     let program = executable(&pipeline, stage);
     if is_own(&program) {
@@ -75,18 +75,16 @@ fn print_help(program: &Path) -> anyhow::Result<ExitCode> {
 }
 
 /// Writes man pages of the program and all its verbs into a folder.
-pub(crate) fn man(program: clap::Command, folder: &Path) -> anyhow::Result<ExitCode> {
+pub(crate) fn man(program: clap::Command, folder: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder)
         .and_then(|()| clap_mangen::generate_to(program, folder))
-        .with_context(|| format!("cannot write man pages into {}", folder.display()))?;
-    Ok(ExitCode::SUCCESS)
+        .with_context(|| format!("cannot write man pages into {}", folder.display()))
 }
 
 /// Prints a shell's completions for the program.
-pub(crate) fn completions(shell: clap_complete::Shell, program: &mut clap::Command) -> ExitCode {
+pub(crate) fn completions(shell: clap_complete::Shell, program: &mut clap::Command) {
     let mut script = Vec::new();
     clap_complete::generate(shell, program, "nerf-sr", &mut script);
     // A reader that closed the pipe early is no error.
     std::io::stdout().write_all(&script).ok();
-    ExitCode::SUCCESS
 }

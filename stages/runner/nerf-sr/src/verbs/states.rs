@@ -1,43 +1,37 @@
 //! `plan`, `why` and `status` print the states of a plan's nodes.
 
-use std::process::ExitCode;
-
-use artifact::{format_count, format_duration, format_size, hash_json, print_line};
-use planning::{Plan, Request, State, short_hash};
-
-use store::Record;
+use artifact::{format_count, format_duration, format_size, label, print_line};
+use planning::{Request, short_hash};
 
 use super::print_json;
 use crate::estimates::Estimates;
-use crate::node_report::PlanReport;
+use crate::planned::{ArtifactReport, PlanReport, age_text};
 use crate::session::{Session, nodes_of_stage};
-use crate::state_text::{age_text, blocking_nodes, by_scene_text, sink_text, state_text};
 
 /// Prints what `run` would do.
-pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::Result<ExitCode> {
-    let (plan, states) = session.plan_with_states(request)?;
+pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::Result<()> {
+    let planned = session.plan_with_states(request)?;
     if json {
-        return print_json(&PlanReport::new(session, &plan, &states, &[])?);
+        return print_json(&PlanReport::new(&planned, &[])?);
     }
-    let estimates = Estimates::new(&plan, &states, &session.store);
-    for (index, state) in states.iter().enumerate() {
-        let node = &plan.nodes[index];
-        let mut text = state_text(session, &plan, index, state, None);
-        if let Some(estimate) = estimates.get(index) {
+    let estimates = Estimates::new(&planned);
+    for (index, node) in planned.plan.nodes.iter().enumerate() {
+        let mut text = planned.state_text(index, None);
+        if let Some(estimate) = estimates.nodes.get(&index) {
             text += &format!("; about {}", estimate.text());
         }
         print_line!("{:<40} {text}", node.label());
-        if let Some(line) = by_scene_text(session, node, state) {
+        if let Some(line) = planned.by_scene_text(index) {
             print_line!("    {line}");
         }
     }
-    for sink in &plan.sinks {
-        print_line!("{:<40} {}", sink.stage, sink_text(&plan, sink, &states));
+    for sink in &planned.plan.sinks {
+        print_line!("{:<40} {}", sink.stage, planned.sink_text(sink));
     }
     if let Some(text) = estimates.total_text(stage::processors().count) {
         print_line!("{text}");
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Explains why a stage is cached, would run, or waits. For a sink, explains the stages that it
@@ -47,85 +41,69 @@ pub(crate) fn why(
     stage: &str,
     request: &Request,
     json: bool,
-) -> anyhow::Result<ExitCode> {
-    let (plan, states) = session.plan_with_states(request)?;
+) -> anyhow::Result<()> {
+    let planned = session.plan_with_states(request)?;
     let records = session.store.records()?;
     if json {
-        let report = PlanReport::new(session, &plan, &states, &records)?;
-        return print_json(&report.for_stage(stage));
+        return print_json(&PlanReport::new(&planned, &records)?.for_stage(stage));
     }
-    if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
-        print_line!("{stage}: {}", sink_text(&plan, sink, &states));
+    let explanation = |index: usize| {
+        let text = planned.state_text(index, Some(&records));
+        format!("{}: {text}", planned.plan.nodes[index].label())
+    };
+    if let Some(sink) = planned.plan.sinks.iter().find(|sink| sink.stage == stage) {
+        print_line!("{stage}: {}", planned.sink_text(sink));
         for index in sink.nodes() {
-            print_line!("  {}", explanation(session, &plan, &states, &records, index));
+            print_line!("  {}", explanation(index));
         }
-        return Ok(ExitCode::SUCCESS);
+        return Ok(());
     }
-    for index in nodes_of_stage(&plan, stage)? {
-        print_line!("{}", explanation(session, &plan, &states, &records, index));
-        if let Some(line) = by_scene_text(session, &plan.nodes[index], &states[index]) {
+    for index in nodes_of_stage(&planned.plan, stage)? {
+        print_line!("{}", explanation(index));
+        if let Some(line) = planned.by_scene_text(index) {
             print_line!("    {line}");
         }
-        for cause in blocking_nodes(&states, index) {
-            print_line!("  {}", explanation(session, &plan, &states, &records, cause));
+        for cause in planned.blocking_nodes(index) {
+            print_line!("  {}", explanation(cause));
         }
     }
-    Ok(ExitCode::SUCCESS)
-}
-
-/// Returns a node's label and state, with the reason.
-fn explanation(
-    session: &Session,
-    plan: &Plan,
-    states: &[State],
-    records: &[Record],
-    index: usize,
-) -> String {
-    let text = state_text(session, plan, index, &states[index], Some(records));
-    format!("{}: {text}", plan.nodes[index].label())
+    Ok(())
 }
 
 /// Prints every stage with its artifact, age and running time.
-pub(crate) fn status(session: &Session, request: &Request, json: bool) -> anyhow::Result<ExitCode> {
-    let (plan, states) = session.plan_with_states(request)?;
-    let (mut jobs, other_jobs) = session.jobs(&plan);
-    jobs.resize(plan.nodes.len(), None);
+pub(crate) fn status(session: &Session, request: &Request, json: bool) -> anyhow::Result<()> {
+    let planned = session.plan_with_states(request)?;
+    let (jobs, other_jobs) = session.jobs(&planned.plan);
+    let mut report = PlanReport::new(&planned, &[])?;
+    for (index, job) in jobs {
+        report.nodes[index].job = Some(job);
+    }
     if json {
-        let mut report = PlanReport::new(session, &plan, &states, &[])?;
-        for (index, job) in jobs.into_iter().enumerate() {
-            report.nodes[index].job = job;
-        }
         return print_json(&report);
     }
-    for (index, state) in states.iter().enumerate() {
-        let mut details: Vec<String> = jobs[index].iter().map(ToString::to_string).collect();
-        match state {
-            State::Cached(record) => details.push(cached_detail(session, record)),
-            State::WillRun { key_parts }
-                if session.store.has_checkpoint(&hash_json(key_parts))? =>
-            {
-                details.push("has a checkpoint to resume from".to_owned());
-            }
-            _ => {}
+    for node in &report.nodes {
+        let mut details: Vec<String> = node.job.iter().map(ToString::to_string).collect();
+        details.extend(node.artifact.as_ref().map(artifact_text));
+        if node.has_checkpoint {
+            details.push("has a checkpoint to resume from".to_owned());
         }
-        let label = plan.nodes[index].label();
-        print_line!("{label:<40} {:<9} {}", state.name(), details.join("; "));
+        let label = label(&node.stage, &node.point);
+        print_line!("{label:<40} {:<9} {}", node.state, details.join("; "));
     }
     if other_jobs > 0 {
         let jobs = format_count(other_jobs, "job");
         print_line!("also queued: {jobs}, for pages or for runs with other arguments");
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
-/// Returns hash, size, running time and age of a cached artifact.
-fn cached_detail(session: &Session, record: &Record) -> String {
-    let size = session.store.manifest(&record.output).map_or(0, |manifest| manifest.size());
+/// Returns hash, size, running time and age of an artifact.
+fn artifact_text(artifact: &ArtifactReport) -> String {
     format!(
         "{}  {:>9}  {:>9}  {}",
-        short_hash(&record.output),
-        format_size(size),
-        format_duration(record.seconds),
-        age_text(record)
+        short_hash(&artifact.output),
+        format_size(artifact.bytes),
+        format_duration(artifact.seconds),
+        age_text(artifact.started_unix)
     )
 }

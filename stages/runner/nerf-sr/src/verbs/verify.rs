@@ -1,6 +1,4 @@
 use std::fmt::Display;
-use std::io;
-use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
@@ -8,6 +6,7 @@ use artifact::{Damage, format_count, print_line};
 use indicatif::{ProgressBar, ProgressStyle};
 use store::{Entered, Store, StoreError};
 
+use crate::publish::exists;
 use crate::waiting::enter_store;
 
 /// Reads all artifacts and records, and compares their contents with their hashes.
@@ -55,30 +54,26 @@ impl Verification<'_> {
     /// Hashes an object again. Garbage collection may delete the object meanwhile, so a problem
     /// counts only if the object still exists after entering the store.
     fn check_object(&mut self, identity: &str) -> anyhow::Result<()> {
-        let store = self.store;
-        if store.verify(identity).is_ok() {
-            self.tally.artifacts += 1;
-            return Ok(());
-        }
-        let _entered = self.enter()?;
-        if is_deleted(&store.object(identity)) {
-            return Ok(());
+        let mut result = self.store.verify(identity);
+        let _entered;
+        if result.is_err() {
+            _entered = self.enter()?;
+            if matches!(exists(&self.store.object(identity)), Ok(false)) {
+                return Ok(());
+            }
+            result = self.store.verify(identity);
         }
         self.tally.artifacts += 1;
-        match store.verify(identity) {
-            Ok(()) => {}
-            Err(problem @ Damage::Unreadable { .. }) => {
-                self.tally.unreadable += 1;
-                self.print(&problem);
-            }
-            Err(damage) => {
-                self.tally.damaged_artifacts += 1;
-                self.print(&damage);
-                if self.remove {
-                    store.remove_object(identity)?;
-                    self.print(&REMOVED_NOTE);
-                }
-            }
+        let Err(problem) = result else { return Ok(()) };
+        self.print(&problem);
+        if matches!(problem, Damage::Unreadable { .. }) {
+            self.tally.unreadable += 1;
+            return Ok(());
+        }
+        self.tally.damaged_artifacts += 1;
+        if self.remove {
+            self.store.remove_object(identity)?;
+            self.print(&REMOVED_NOTE);
         }
         Ok(())
     }
@@ -107,7 +102,7 @@ impl Verification<'_> {
     /// Enters the store. This fails if a newer version of nerf-sr has upgraded the store meanwhile:
     /// content that looks damaged to this version may then be intact. A signal ends the process.
     fn enter(&self) -> anyhow::Result<Entered> {
-        Ok(enter_store(self.store, &AtomicBool::new(false), &|text| self.print(&text))?)
+        enter_store(self.store, &AtomicBool::new(false), &|text| self.print(&text))
     }
 
     fn print(&self, line: &dyn Display) {
@@ -129,19 +124,12 @@ impl Tally {
             line += &format!(", {unreadable} unreadable");
         }
         print_line!("{line}");
-        if damaged_artifacts + damaged_records + unreadable == 0 {
-            ExitCode::SUCCESS
-        } else {
-            ExitCode::from(3)
-        }
+        let is_sound = damaged_artifacts + damaged_records + unreadable == 0;
+        if is_sound { ExitCode::SUCCESS } else { ExitCode::from(3) }
     }
 }
 
 const REMOVED_NOTE: &str = "  removed; the next run creates it again";
-
-fn is_deleted(path: &Path) -> bool {
-    path.symlink_metadata().is_err_and(|error| error.kind() == io::ErrorKind::NotFound)
-}
 
 /// Creates a progress bar, which is visible only on a terminal.
 fn new_progress_bar(bytes: u64) -> ProgressBar {

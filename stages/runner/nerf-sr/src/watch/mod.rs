@@ -18,8 +18,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use planning::stage_call::{Call, Display, StageFailure, Watcher};
-use stage::{Event, SUMMARY_FILE};
+use planning::stage_call::{Call, Display, Watcher, read_summary};
+use stage::Event;
 
 pub(crate) use chain::Chain;
 use chain::Link;
@@ -46,7 +46,7 @@ pub(crate) struct Watch {
 /// A watched training.
 pub(crate) struct Watching<'a> {
     pub(crate) watch: &'a Watch,
-    pub(crate) chain: &'a Chain,
+    pub(crate) chain: &'a Chain<'a>,
     pub(crate) label: &'a str,
     /// Temporary folder of this training's looks, removed when the training ends.
     pub(crate) scratch: PathBuf,
@@ -80,10 +80,7 @@ impl Watching<'_> {
             let limit = MIN_TIME_LIMIT.max(budget.expected() * MAX_TIME_FACTOR);
             let look = Look { watching: self, view: &view, deadline: started + limit };
             match look.take(training) {
-                Ok(Some(result)) => {
-                    budget.record_look(result.processor);
-                    self.show(&result, &view.name)?;
-                }
+                Ok(Some(processor)) => budget.record_look(processor),
                 Ok(None) => budget.record_miss(started.elapsed()),
                 Err(_) if self.is_over.load(Ordering::Relaxed) => return Ok(()),
                 Err(_) if Instant::now() >= look.deadline => {
@@ -93,26 +90,6 @@ impl Watching<'_> {
                 Err(failure) => return Err(failure).context("no longer watched"),
             }
         }
-        Ok(())
-    }
-
-    /// Prints the scores and writes the picture to the folder of pictures.
-    fn show(&self, result: &LookResult, view: &str) -> anyhow::Result<()> {
-        let folder = &self.watch.folder;
-        let picture = folder.join(picture_file_name(self.label));
-        let partial = picture.with_extension("partial");
-        std::fs::create_dir_all(folder)
-            .and_then(|()| std::fs::copy(&result.picture, &partial))
-            .and_then(|_| std::fs::rename(&partial, &picture))
-            .with_context(|| format!("no longer watched: {}", picture.display()))?;
-        if std::env::var_os("NO_COLOR").is_none()
-            && let Ok(image) = pixels::read_png(&picture)
-        {
-            self.display.picture(|columns, rows| half_blocks(&image, columns, rows));
-        }
-        let LookResult { field, scores, .. } = result;
-        let (label, picture) = (self.label, picture.display());
-        self.display.line(&format!("{label}: view {view}: {scores} ({field}): {picture}"));
         Ok(())
     }
 }
@@ -135,26 +112,13 @@ struct Look<'a> {
     deadline: Instant,
 }
 
-/// Result of a look.
-struct LookResult {
-    picture: PathBuf,
-    /// Summary of the field.
-    field: String,
-    /// Summary of the view's scores.
-    scores: String,
-    /// Processor time of the look.
-    processor: Duration,
-}
-
 impl Look<'_> {
-    /// Takes the look. `None` if the stage can't create a field, usually because no checkpoint
-    /// exists yet.
-    fn take(&self, training: &Call<'_>) -> Result<Option<LookResult>, StageFailure> {
+    /// Takes the look and shows it. Returns its processor time; `None` if the stage can't create a
+    /// field, usually because no checkpoint exists yet.
+    fn take(&self, training: &Call<'_>) -> anyhow::Result<Option<Duration>> {
         let scratch = &self.watching.scratch;
-        if scratch.exists() {
-            std::fs::remove_dir_all(scratch).map_err(|e| StageFailure::at(scratch, &e))?;
-        }
-        std::fs::create_dir_all(scratch).map_err(|e| StageFailure::at(scratch, &e))?;
+        std::fs::remove_dir_all(scratch).ok();
+        std::fs::create_dir_all(scratch).with_context(|| scratch.display().to_string())?;
         let [field, views, scores] =
             ["field", "views", "scores"].map(|folder| scratch.join(folder));
         let call =
@@ -163,65 +127,76 @@ impl Look<'_> {
         let Chain { render, score } = self.watching.chain;
         let rendering = self.call_link(render, "render", &field, &views)?;
         let scoring = self.call_link(score, "score", &views, &scores)?;
-        Ok(Some(LookResult {
-            picture: views.join(scene::preview_file(&self.view.name)),
-            field: read_summary(&field)?,
-            scores: read_summary(&scores)?,
-            processor: reading + rendering + scoring,
-        }))
+        let [field, scores] =
+            [field, scores].map(|output| read_summary(&output).unwrap_or_default());
+        self.show(&views.join(scene::preview_file(&self.view.name)), field.trim(), scores.trim())?;
+        Ok(Some(reading + rendering + scoring))
+    }
+
+    /// Prints the summaries of the field and the scores, and copies the picture to the folder of
+    /// pictures.
+    fn show(&self, rendered: &Path, field: &str, scores: &str) -> anyhow::Result<()> {
+        let Watching { watch, label, display, .. } = self.watching;
+        let picture = watch.folder.join(picture_file_name(label));
+        let partial = picture.with_extension("partial");
+        std::fs::create_dir_all(&watch.folder)
+            .and_then(|()| std::fs::copy(rendered, &partial))
+            .and_then(|_| std::fs::rename(&partial, &picture))
+            .with_context(|| picture.display().to_string())?;
+        if std::env::var_os("NO_COLOR").is_none()
+            && let Ok(image) = pixels::read_png(&picture)
+        {
+            display.picture(|columns, rows| half_blocks(&image, columns, rows));
+        }
+        let (view, picture) = (&self.view.name, picture.display());
+        display.line(&format!("{label}: view {view}: {scores} ({field}): {picture}"));
+        Ok(())
     }
 
     /// Calls a block with the previous block's output; the other inputs are cut to the watched
     /// view. Returns the processor time.
     fn call_link(
         &self,
-        link: &Link,
+        link: &Link<'_>,
         name: &str,
         previous: &Path,
         output: &Path,
-    ) -> Result<Duration, StageFailure> {
+    ) -> anyhow::Result<Duration> {
         let scratch = self.watching.scratch.join(format!("{name}-inputs"));
         let params = scratch.join("params.json");
         std::fs::create_dir_all(&scratch)
-            .and_then(|()| artifact::write_json(&params, &link.parameters))
-            .map_err(|e| StageFailure::at(&params, &e))?;
-        let mut inputs = vec![(link.chained_input.clone(), previous.to_path_buf())];
+            .and_then(|()| artifact::write_json(&params, &link.node.parameters))
+            .with_context(|| params.display().to_string())?;
+        let mut inputs = vec![(link.chained_input.to_owned(), previous.to_path_buf())];
         for (input, folder) in &link.inputs {
             let cut = scratch.join(input);
-            self.view.copy_cut(folder, &cut).map_err(|e| StageFailure::at(&cut, &e))?;
-            inputs.push((input.clone(), cut));
+            self.view.copy_cut(folder, &cut).with_context(|| cut.display().to_string())?;
+            inputs.push(((*input).to_owned(), cut));
         }
         self.call(&Call {
             label: self.watching.label,
-            program: &link.program.path,
-            description: &link.program.description,
+            program: &link.node.program.path,
+            description: &link.node.program.description,
             params: &params,
             inputs: &inputs,
             hashes: &[],
             output,
             work: None,
             from_checkpoint: false,
-            device: &link.device,
+            device: link.device,
             threads: 1,
             lock: None,
         })
     }
 
     /// Calls a stage and returns its processor time.
-    fn call(&self, call: &Call<'_>) -> Result<Duration, StageFailure> {
+    fn call(&self, call: &Call<'_>) -> anyhow::Result<Duration> {
         let stop = AtomicBool::new(false);
         let deadline = StopAtDeadline { look: self, stop: &stop };
         let (usage, result) = call.run(&self.watching.scratch.join("log"), &deadline, &stop);
         result?;
         Ok(Duration::from_secs_f64(usage.processor_seconds))
     }
-}
-
-/// Reads the summary in a stage's output.
-fn read_summary(output: &Path) -> Result<String, StageFailure> {
-    let file = output.join(SUMMARY_FILE);
-    let text = std::fs::read_to_string(&file).map_err(|e| StageFailure::at(&file, &e))?;
-    Ok(text.trim().to_owned())
 }
 
 /// Stops a call when the training has ended or the deadline has passed. Prints nothing.

@@ -2,8 +2,7 @@ use std::io;
 use std::path::Path;
 
 use artifact::MANIFEST_FILE;
-use scene::VIEWS_FILE;
-use serde_json::Value;
+use scene::{Camera, VIEWS_FILE, View, Views};
 
 use super::chain::Chain;
 
@@ -16,30 +15,27 @@ pub(super) struct WatchedView {
 
 impl WatchedView {
     /// Finds a view by name, or the chain's first view if the name is empty.
-    pub(super) fn find(chain: &Chain, name: &str) -> anyhow::Result<Self> {
-        let mut views: Vec<Value> = Vec::new();
-        for (_, folder) in &chain.render.inputs {
-            if let Ok(mut list) = read_list(folder) {
-                views.append(views_of(&mut list).unwrap_or(&mut Vec::new()));
-            }
-        }
-        let found = views.iter().find(|view| name.is_empty() || name_of(view) == Some(name));
+    pub(super) fn find(chain: &Chain<'_>, name: &str) -> anyhow::Result<Self> {
+        let folders = chain.render.inputs.iter().map(|(_, folder)| folder);
+        let lists = folders.filter_map(|folder| Views::read_folder(folder).ok());
+        let views: Vec<View> = lists.flat_map(|list| list.views).collect();
+        let found = views.iter().find(|view| name.is_empty() || view.camera.name == name);
         let Some(view) = found else {
             if name.is_empty() {
                 anyhow::bail!("no view to watch: the inputs list none");
             }
-            let known: Vec<&str> = views.iter().filter_map(name_of).collect();
+            let known = views.iter().map(|view| view.camera.name.as_str());
             anyhow::bail!("no view {name}; {}", artifact::known_names(name, known));
         };
-        let [width, height] = ["width", "height"]
-            .map(|side| view["camera"]["intrinsics"][side].as_u64().unwrap_or(0));
-        Ok(Self { name: name_of(view).unwrap_or_default().to_owned(), pixels: width * height })
+        let Camera { name, intrinsics, .. } = &view.camera;
+        let pixels = u64::from(intrinsics.width) * u64::from(intrinsics.height);
+        Ok(Self { name: name.clone(), pixels })
     }
 
     /// Creates `cut`, a copy of `folder` by links whose `views.json` lists this view alone. A
     /// folder without `views.json` becomes one link.
     pub(super) fn copy_cut(&self, folder: &Path, cut: &Path) -> io::Result<()> {
-        let Ok(mut list) = read_list(folder) else {
+        let Ok(mut list) = Views::read_folder(folder) else {
             return std::os::unix::fs::symlink(folder, cut);
         };
         std::fs::create_dir_all(cut)?;
@@ -50,28 +46,14 @@ impl WatchedView {
                 std::os::unix::fs::symlink(entry.path(), cut.join(entry.file_name()))?;
             }
         }
-        if let Some(views) = views_of(&mut list) {
-            views.retain(|view| name_of(view) == Some(&self.name));
-        }
+        list.views.retain(|view| view.camera.name == self.name);
         artifact::write_json(&cut.join(VIEWS_FILE), &list)
     }
 }
 
-fn read_list(folder: &Path) -> io::Result<Value> {
-    Ok(serde_json::from_slice(&std::fs::read(folder.join(VIEWS_FILE))?)?)
-}
-
-fn views_of(list: &mut Value) -> Option<&mut Vec<Value>> {
-    list.get_mut("views")?.as_array_mut()
-}
-
-fn name_of(view: &Value) -> Option<&str> {
-    view["camera"]["name"].as_str()
-}
-
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
+    use scene::{Background, Bounds, Intrinsics};
 
     use super::*;
 
@@ -82,11 +64,18 @@ mod tests {
         std::fs::create_dir_all(source.join("images")).unwrap();
         std::fs::write(source.join("images/b.png"), "b").unwrap();
         std::fs::write(source.join(MANIFEST_FILE), "{}").unwrap();
-        let view = |name| json!({"camera": {"name": name}, "image": "images/b.png"});
-        let list = |views: &[Value]| json!({"background": "white", "views": views});
-        artifact::write_json(&source.join(VIEWS_FILE), &list(&[view("a"), view("b")])).unwrap();
+        let view = |name: &str| {
+            let camera = Camera {
+                name: name.to_owned(),
+                intrinsics: Intrinsics::from_angle_x(30, 20, 0.7),
+                camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]],
+            };
+            View { image: Some("images/b.png".to_owned()), ..View::camera_only(camera) }
+        };
+        let list = |views| Views::new(Background::White, Bounds::cube(1.0, 2.0, 6.0), views);
+        artifact::write_json(&source.join(VIEWS_FILE), &list(vec![view("a"), view("b")])).unwrap();
         WatchedView { name: "b".to_owned(), pixels: 1 }.copy_cut(&source, &copy).unwrap();
-        assert_eq!(read_list(&copy).unwrap(), list(&[view("b")]));
+        assert_eq!(Views::read_folder(&copy).unwrap(), list(vec![view("b")]));
         assert_eq!(std::fs::read_to_string(copy.join("images/b.png")).unwrap(), "b");
         assert!(!copy.join(MANIFEST_FILE).exists());
     }

@@ -8,22 +8,17 @@ use workload::{PixelStorage, RayBudget, TrainingMemory, grid_training_bytes, pro
 use super::number;
 use crate::estimates::work::{SceneKind, Work};
 
-/// Seconds per training ray late in a training, without the seconds per step. Measured on lego
-/// 100×2, fern 252×2 and the demo scene with backdrop (docs/results/engine.md).
-const OBJECT_RAY_SECONDS: f64 = 10.8e-6;
-const FRUSTUM_RAY_SECONDS: f64 = 22e-6;
-const UNBOUNDED_RAY_SECONDS: f64 = 20e-6;
+/// Seconds per training ray late in a training, without those per step; samples of such a ray; and
+/// seconds per step of any size. Measured on lego 100×2, fern 252×2 and the demo scene with
+/// backdrop (docs/results/engine.md), steps with 6,144 to 24,576 `samples_per_step`. More cells of
+/// a frustum are occupied, and its tables are larger.
+const OBJECT: (f64, f64, f64) = (10.8e-6, 22.0, 3.3e-3);
+const FRUSTUM: (f64, f64, f64) = (22e-6, 36.0, 8.3e-3);
+const UNBOUNDED: (f64, f64, f64) = (20e-6, 36.0, 3.3e-3);
 /// Exponents by which a ray's cost grows with `march_steps` and `hidden_dim`: 0.58 and 0.68 of the
 /// time at half of either (docs/design/008).
 const STEPS_EXPONENT: f64 = 0.8;
 const HIDDEN_EXPONENT: f64 = 0.55;
-/// Seconds per step of any size: lego 100×2 and fern 252×2 with 6,144 to 24,576 `samples_per_step`.
-/// More cells of a frustum are occupied, and its tables are larger.
-const STEP_SECONDS: f64 = 3.3e-3;
-const FRUSTUM_STEP_SECONDS: f64 = 8.3e-3;
-/// Samples of a ray late in a training.
-const OBJECT_RAY_SAMPLES: f64 = 22.0;
-const OPAQUE_RAY_SAMPLES: f64 = 36.0;
 /// Mean number of samples of a step over `samples_per_step`: steps grow to 8/3 times as many.
 const STEP_GROWTH: f64 = 2.0;
 /// Extra cost of the first steps with the default `samples_per_step`, as a number of rays late in a
@@ -79,9 +74,9 @@ pub(super) fn training_seconds(parameters: &Value, work: &Work) -> Option<f64> {
         fields * first_steps(rays / fields) * step_samples / DEFAULT_STEP_SAMPLES
     };
     let (ray, ray_samples, step) = match work.kind {
-        SceneKind::Object => (OBJECT_RAY_SECONDS, OBJECT_RAY_SAMPLES, STEP_SECONDS),
-        SceneKind::Frustum => (FRUSTUM_RAY_SECONDS, OPAQUE_RAY_SAMPLES, FRUSTUM_STEP_SECONDS),
-        SceneKind::Unbounded => (UNBOUNDED_RAY_SECONDS, OPAQUE_RAY_SAMPLES, STEP_SECONDS),
+        SceneKind::Object => OBJECT,
+        SceneKind::Frustum => FRUSTUM,
+        SceneKind::Unbounded => UNBOUNDED,
     };
     let (samples, sample) = field_factors(parameters, work.kind)?;
     let steps = (samples * rays + first_steps) * ray_samples / (STEP_GROWTH * step_samples);
