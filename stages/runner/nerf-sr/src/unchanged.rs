@@ -7,9 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use artifact::{Damage, Failure, MANIFEST_FILE, Manifest, write_atomically};
-use planning::{
-    HashedInputs, Node, NodeInput, Origin, Source, StageProgram, Stamp, read_source,
-};
+use planning::{HashedInputs, Node, NodeInput, Origin, Source, StageProgram, Stamp, read_source};
 use store::{Attempt, Store};
 
 /// Calls a program if it is the planned one, and fails if it was changed until its end. Only a
