@@ -104,8 +104,9 @@ impl PathFile {
         let height = f64::from(camera.height);
         let fov = 2.0 * (0.5 * height / camera.fx.max(camera.fy)).atan().to_degrees();
         let aspect = f64::from(camera.width) / height;
-        let frame = |pose| PathFrame { camera_to_world: matrix_of(pose), fov, aspect };
-        let camera_path: Vec<PathFrame> = poses.iter().map(frame).collect();
+        let camera_path: Vec<PathFrame> = (poses.iter())
+            .map(|pose| PathFrame { camera_to_world: matrix_of(pose), fov, aspect })
+            .collect();
         // As nerfstudio's viewer reads it.
         let key = |frame: &PathFrame| {
             serde_json::json!({

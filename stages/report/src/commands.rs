@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use artifact::{RunNode, RunRecord};
+use artifact::{RunNode, RunRecord, shell_quoted};
 use maud::{Markup, html};
 
 /// Section with the run's command line.
@@ -33,7 +33,7 @@ fn command(line: &str) -> Markup {
 /// Returns the command line of the run, quoted for a shell; `None` if it isn't recorded.
 pub(crate) fn run_command(run: &RunRecord) -> Option<String> {
     let (program, words) = run.command.split_first()?;
-    let words = words.iter().map(|word| quoted(word));
+    let words = words.iter().map(|word| shell_quoted(word));
     Some([file_name(program.as_ref())].into_iter().chain(words).collect::<Vec<_>>().join(" "))
 }
 
@@ -43,22 +43,14 @@ pub(crate) fn stage_command(run: &RunRecord, node: &RunNode) -> Markup {
         return html! {};
     }
     let parameters = serde_json::Value::Object(node.parameters.clone()).to_string();
-    let mut line = format!("{} --params <(echo {})", node.program, quoted(&parameters));
+    let mut line = format!("{} --params <(echo {})", node.program, shell_quoted(&parameters));
     for (name, input) in &node.inputs {
         let folder = run.folder_of(input);
-        line += &format!(" \\\n  --input {}", quoted(&format!("{name}={}", folder.display())));
+        line +=
+            &format!(" \\\n  --input {}", shell_quoted(&format!("{name}={}", folder.display())));
     }
-    line += &format!(" \\\n  --output {}", quoted(&format!("my-{}", node.stage)));
+    line += &format!(" \\\n  --output {}", shell_quoted(&format!("my-{}", node.stage)));
     command(&line)
-}
-
-/// Quotes a word for a shell if necessary.
-fn quoted(word: &str) -> String {
-    let needs_quotes = |c: char| !c.is_ascii_alphanumeric() && !"-_./=,:+@%".contains(c);
-    if !word.is_empty() && !word.contains(needs_quotes) {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', r"'\''"))
 }
 
 /// Returns the last component of a path.

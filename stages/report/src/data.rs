@@ -243,13 +243,14 @@ fn layer_data(
 }
 
 fn figures(report: &Report<'_>) -> Vec<FigureData> {
-    let data = |figure: &ScoreFormat| FigureData {
-        label: figure.label.clone(),
-        digits: figure.digits,
-        higher_is_better: figure.higher_is_better,
-        definition: definition(report, figure).map_or("", |(_, text)| text).to_owned(),
-    };
-    report.known_figures().into_iter().map(data).collect()
+    let mut figures = Vec::new();
+    for figure in report.known_figures() {
+        let definition = definition(report, figure).map_or("", |(_, text)| text).to_owned();
+        let (label, digits) = (figure.label.clone(), figure.digits);
+        let higher_is_better = figure.higher_is_better;
+        figures.push(FigureData { label, digits, higher_is_better, definition });
+    }
+    figures
 }
 
 fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {

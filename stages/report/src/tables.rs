@@ -113,10 +113,10 @@ pub(crate) fn definition<'a>(
     let row = report.rows.iter().find(|row| row.mean(figure).is_some())?;
     let conventions = row.metrics.conventions().as_object()?;
     // Networks of LPIPS, such as `lpips_vgg`, share a definition.
-    let is_own = |name: &str| {
-        metric.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('_'))
-    };
-    let (name, text) = conventions.iter().find(|(name, _)| is_own(name))?;
+    let (name, text) = conventions.iter().find(|(name, _)| {
+        let rest = metric.strip_prefix(name.as_str());
+        rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('_'))
+    })?;
     Some((name, text.as_str()?))
 }
 

@@ -28,9 +28,10 @@ fn targets(folder: &str, repository: &Path) -> String {
         .filter(|path| path.extension().is_some_and(|extension| extension == "yaml"))
         .collect();
     files.sort();
-    let target = |file: &PathBuf| {
+    let mut list = String::new();
+    for file in files {
         let name = file.file_name().and_then(|name| name.to_str()).expect("the name is UTF-8");
-        format!("    ({folder:?}, {name:?}, include_str!({file:?})),\n")
-    };
-    files.iter().map(target).collect()
+        list += &format!("    ({folder:?}, {name:?}, include_str!({file:?})),\n");
+    }
+    list
 }

@@ -34,7 +34,8 @@ impl Figures {
         }
     }
 
-    /// Returns whether lower values are better: as declared by a metric, otherwise as known by name.
+    /// Returns whether lower values are better: as declared by a metric, otherwise as known by
+    /// name.
     /// `None` if no value is known to be better than another.
     pub(crate) fn lower_is_better(&self, name: &str) -> Option<bool> {
         let is_higher_better = match (self.0.get(name), added(name)) {

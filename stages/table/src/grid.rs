@@ -167,8 +167,8 @@ impl Layout<'_> {
         line
     }
 
-    /// Returns the keys in which a line differs from those it is compared with. The method is one of
-    /// them if its name contains the value of another.
+    /// Returns the keys in which a line differs from those it is compared with. The method is one
+    /// of them if its name contains the value of another.
     fn compared_keys(&self) -> Vec<&str> {
         let mut keys: Vec<&str> = self.params.relative_to.keys().map(String::as_str).collect();
         let is_in_name = |key: &&str| {

@@ -150,8 +150,8 @@ fn seeds_have_a_spread() {
     assert_eq!(spread(&rows), "PSNR over 2 results: 26.00 ± 1.41, from 25.00 to 27.00");
 }
 
-/// A row without all scenes says so, and is neither the best nor on the front. Differences are those
-/// of common scenes.
+/// A row without all scenes says so, and is neither the best nor on the front. Differences are
+/// those of common scenes.
 #[test]
 fn means_over_different_scenes_are_not_compared() {
     let mut rows = rows();

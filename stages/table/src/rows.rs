@@ -139,9 +139,10 @@ fn read<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
 fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     let [trained, rendered] = run.training_and_rendering(index);
     let mut refined = rendered.clone();
-    let is_field = |parent: usize| run.nodes[parent].kind == "field";
-    refined
-        .retain(|&i| !run.nodes[i].inputs.values().any(|input| input.node.is_some_and(is_field)));
+    refined.retain(|&i| {
+        let mut parents = run.nodes[i].inputs.values().filter_map(|input| input.node);
+        !parents.any(|parent| run.nodes[parent].kind == "field")
+    });
     // Not `Iterator::sum`, whose result is -0.0 without elements.
     let [training, rendering, refining] = [&trained, &rendered, &refined]
         .map(|nodes| nodes.iter().fold(0.0, |sum, &i| sum + run.nodes[i].seconds));

@@ -6,8 +6,8 @@ use stage::Context;
 /// Interval of the views that are left out of training (design note 015).
 const HOLD_OUT_EVERY: usize = 8;
 
-/// Splits examples into those to train on and those to score the network on: the fifth of each eight,
-/// or the last of fewer than five. A single example is used for both.
+/// Splits examples into those to train on and those to score the network on: the fifth of each
+/// eight, or the last of fewer than five. A single example is used for both.
 pub(crate) fn split<T: Clone>(all: Vec<T>) -> (Vec<T>, Vec<T>) {
     if all.len() == 1 {
         return (all.clone(), all);

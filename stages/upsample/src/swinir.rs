@@ -180,8 +180,8 @@ fn read_convs(weights: &Weights, name: &str, width: i64) -> Result<Vec<Layer>, W
 }
 
 /// Reads the head of the kind that the file has, and its scale: pixel shuffle directly to colours
-/// (the lightweight models), in one or several steps (the classical ones), or enlargement to nearest
-/// neighbours and convolution (the real-world ones).
+/// (the lightweight models), in one or several steps (the classical ones), or enlargement to
+/// nearest neighbours and convolution (the real-world ones).
 fn read_head(weights: &Weights, width: i64) -> Result<(Vec<Layer>, i64), WeightsError> {
     let conv = |name: &str, outputs, inputs| {
         Ok::<_, WeightsError>(Layer::Conv(Conv::read(weights, name, [outputs, inputs, 3, 3])?, 1))

@@ -109,8 +109,8 @@ impl Film<'_> {
     }
 }
 
-/// Creates an animated PNG of opaque frames, which repeats forever, with the given number of frames,
-/// at `rate` frames per second, at most 600.
+/// Creates an animated PNG of opaque frames, which repeats forever, with the given number of
+/// frames, at `rate` frames per second, at most 600.
 fn create_animation(
     path: &Path,
     (width, height): (usize, usize),

@@ -25,8 +25,9 @@ impl Planned<'_> {
         while let Some(index) = open.pop() {
             let State::Waits { on } = &self.states[index] else { continue };
             open.extend(on);
-            let will_run = |&&parent: &&usize| matches!(self.states[parent], State::WillRun { .. });
-            found.extend(on.iter().filter(will_run));
+            found.extend(
+                on.iter().filter(|parent| matches!(self.states[**parent], State::WillRun { .. })),
+            );
         }
         found
     }

@@ -1,6 +1,6 @@
 //! Messages at the end of a run.
 
-use artifact::format_count;
+use artifact::{format_count, shell_quoted};
 
 /// Returns the message after a successful run: the numbers of stages that ran and were cached.
 pub(crate) fn end_message(ran: usize, all: usize, has_written_page: bool) -> String {
@@ -38,15 +38,6 @@ pub(crate) fn command_text<'a>(words: impl IntoIterator<Item = &'a str>) -> Stri
     words.into_iter().map(shell_quoted).collect::<Vec<_>>().join(" ")
 }
 
-/// Quotes a word for a POSIX shell where necessary.
-fn shell_quoted(word: &str) -> String {
-    let is_plain = word.chars().all(|c| c.is_ascii_alphanumeric() || "_@%+=:,./-".contains(c));
-    if is_plain && !word.is_empty() {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', r"'\''"))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -58,20 +49,6 @@ mod tests {
         assert_eq!(end_message(0, 5, true), "0 of 5 stages ran, 5 were cached");
         assert_eq!(end_message(0, 1, false), "nothing to run: the stage is cached");
         assert_eq!(end_message(0, 5, false), "nothing to run: all 5 stages are cached");
-    }
-
-    #[test]
-    fn arguments_are_quoted_for_a_shell() {
-        for (argument, quoted) in [
-            ("train-ss", "train-ss"),
-            ("dataset=/data/lego,./x", "dataset=/data/lego,./x"),
-            ("dataset=my scenes/Bäume", "'dataset=my scenes/Bäume'"),
-            ("name=it's $(rm)", r"'name=it'\''s $(rm)'"),
-            ("~/x", "'~/x'"),
-            ("", "''"),
-        ] {
-            assert_eq!(shell_quoted(argument), quoted);
-        }
     }
 
     #[test]

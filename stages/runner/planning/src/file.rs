@@ -273,11 +273,10 @@ const MAX_NAME_BYTES: usize = 100;
 
 /// Returns whether a stage's name can be part of file names and command lines.
 fn is_stage_name(name: &str) -> bool {
-    let is_forbidden = |c: char| c.is_control() || c.is_whitespace() || ['/', '\\'].contains(&c);
     (1..=MAX_NAME_BYTES).contains(&name.len())
         && !name.starts_with(['.', '-'])
         && !name.contains("..")
-        && !name.contains(is_forbidden)
+        && !name.contains(|c: char| c.is_control() || c.is_whitespace() || "/\\".contains(c))
 }
 
 /// Returns the parser's message without the line, which the location contains.

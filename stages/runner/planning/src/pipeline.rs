@@ -87,7 +87,8 @@ impl Pipeline {
         file.map_or_else(|| self.file_of_block(stage), Arc::as_ref)
     }
 
-    /// Returns whether a part of a block is inherited: the first file with the block doesn't have it.
+    /// Returns whether a part of a block is inherited: the first file with the block doesn't have
+    /// it.
     pub(crate) fn is_inherited(&self, stage: &str, part: Part) -> bool {
         !self.file_of_block(stage).has(stage, part)
     }

@@ -65,8 +65,8 @@ impl Quality {
         ROWS.values().any(|row| row.contains_key(&program.description.name))
     }
 
-    /// Returns a note if a block named after a program with qualities runs a program of another name
-    /// that has some of these parameters.
+    /// Returns a note if a block named after a program with qualities runs a program of another
+    /// name that has some of these parameters.
     pub(crate) fn note(block: &str, program: &StageProgram) -> Option<String> {
         let name = &program.description.name;
         let row = ROWS[&Self::default()].get(block).filter(|_| !Self::affects(program))?;

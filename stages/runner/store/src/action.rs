@@ -40,8 +40,8 @@ pub struct Record {
     /// Peak resident memory of the process in bytes; missing in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_memory: Option<u64>,
-    /// Processor time of all threads in seconds, summed like `seconds`; missing in records of earlier
-    /// versions.
+    /// Processor time of all threads in seconds, summed like `seconds`; missing in records of
+    /// earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub processor_seconds: Option<f64>,
     /// Cost by the runner's model; missing for stages without a model.

@@ -54,8 +54,8 @@ impl Attempt {
         remove_if_found(&self.work)
     }
 
-    /// Returns the time that earlier attempts spent on the checkpoints; zero without a checkpoint or
-    /// a recorded time.
+    /// Returns the time that earlier attempts spent on the checkpoints; zero without a checkpoint
+    /// or a recorded time.
     pub fn time_spent(&self) -> TimeSpent {
         let has_checkpoint =
             fs::read_dir(&self.work).is_ok_and(|mut entries| entries.next().is_some());

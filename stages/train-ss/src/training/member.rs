@@ -182,8 +182,8 @@ impl<'a> Member<'a> {
         // While cameras move, their silhouettes would empty wrong cells.
         let cells = cells.filter(|_| !params.pose_refinement);
         let checkpoints = Checkpoints::new(work);
-        let new_trainer = || self.new_trainer(views.bounds, cells);
-        let (trainer, curve) = checkpoints.resume(new_trainer, &mut supervision, log)?;
+        let (trainer, curve) =
+            checkpoints.resume(|| self.new_trainer(views.bounds, cells), &mut supervision, log)?;
         Ok(Training { trainer, supervision, checkpoints, curve })
     }
 

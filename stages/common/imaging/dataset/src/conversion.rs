@@ -95,8 +95,7 @@ fn find_record3d(folder: &Path) -> Option<String> {
     } else if has("rgb") && has("depth") && (has("metadata.json") || has("metadata")) {
         (folder.join("rgb"), false)
     } else {
-        let is_video = |path: &PathBuf| has_extension(path, "r3d");
-        (visible_entries(folder).into_iter().find(is_video)?, true)
+        (visible_entries(folder).into_iter().find(|path| has_extension(path, "r3d"))?, true)
     };
     let data = if has("EXR_RGBD") { &sign } else { folder };
     let command = conversion("record3d", data, data);

@@ -26,8 +26,8 @@ pub(crate) fn frame_label(list: &Path, index: usize, file: &str) -> String {
     format!("{}: frame {index} ({})", path_text(list), printable(&shortened(file)))
 }
 
-/// Returns the error of a list none of whose images exists. `folder` is the folder in which all were
-/// expected, if there is a single one.
+/// Returns the error of a list none of whose images exists. `folder` is the folder in which all
+/// were expected, if there is a single one.
 pub(crate) fn images_missing(count: usize, folder: Option<&Path>, first: &str) -> anyhow::Error {
     let folder = folder.map(|folder| format!(" in {}", path_text(folder))).unwrap_or_default();
     let first = shortened(first);

@@ -158,10 +158,9 @@ fn each_name(
     paths: &[PathBuf],
     name: impl Fn(&Path) -> anyhow::Result<String>,
 ) -> anyhow::Result<Vec<String>> {
-    let named = |(index, path): (usize, &PathBuf)| {
-        name(path).with_context(|| frame_label(list, index, &path_text(path)))
-    };
-    paths.iter().enumerate().map(named).collect()
+    (paths.iter().enumerate())
+        .map(|(index, path)| name(path).with_context(|| frame_label(list, index, &path_text(path))))
+        .collect()
 }
 
 fn name_with_folders(path: &Path, separator: &str) -> anyhow::Result<String> {

@@ -15,9 +15,9 @@ const FISHEYE_MODELS: [&str; 5] =
 const PANORAMAS: [&str; 2] = ["equirectangular", "latlong"];
 
 /// Returns the distortion of a frame's lens, with instant-ngp's and nerfstudio's keys; fails for a
-/// model that isn't supported. For a fisheye lens k1 to k4 are OpenCV's. For a perspective lens k4 is
-/// Brown's fourth radial term, as in nerfstudio, unless the model is OpenCV's rational one, the only
-/// one with k5 and k6.
+/// model that isn't supported. For a fisheye lens k1 to k4 are OpenCV's. For a perspective lens k4
+/// is Brown's fourth radial term, as in nerfstudio, unless the model is OpenCV's rational one, the
+/// only one with k5 and k6.
 pub(crate) fn distortion(entry: &Entry) -> anyhow::Result<Distortion> {
     if let Some(model) = unsupported_projection(entry) {
         bail!(unsupported_model(model));
@@ -53,9 +53,10 @@ pub(crate) fn distortion(entry: &Entry) -> anyhow::Result<Distortion> {
 
 /// Returns the name of instant-ngp's projection if it isn't supported.
 fn unsupported_projection(entry: &Entry) -> Option<&'static str> {
-    let is_set = |name: &&str| entry.value(name) == Some(&Value::Bool(true));
-    let found = ["equirectangular", "latlong", "orthographic"].into_iter().find(is_set);
-    found.or_else(|| entry.has("ftheta_p0").then_some("ftheta"))
+    ["equirectangular", "latlong", "orthographic"]
+        .into_iter()
+        .find(|name| entry.value(name) == Some(&Value::Bool(true)))
+        .or_else(|| entry.has("ftheta_p0").then_some("ftheta"))
 }
 
 /// Returns the error for a camera model that isn't supported.

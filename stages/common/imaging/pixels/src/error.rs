@@ -19,8 +19,8 @@ pub enum PixelError {
         /// Reason, as a sentence fragment.
         reason: String,
     },
-    /// The image format is not supported, the image has more than [`MAX_PIXELS`] pixels, or a sample
-    /// is NaN or infinite.
+    /// The image format is not supported, the image has more than [`MAX_PIXELS`] pixels, or a
+    /// sample is NaN or infinite.
     #[error("{0}")]
     Unsupported(String),
 }

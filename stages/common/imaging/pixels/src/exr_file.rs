@@ -246,8 +246,8 @@ pub fn exr_reading_bytes(path: &Path) -> Result<u64, PixelError> {
     Ok(4 * samples.sum::<u64>())
 }
 
-/// Reads the windows of the first layer from the header: width and height of the display window, and
-/// column and row of the data window's first pixel. Fails if the data window is not inside the
+/// Reads the windows of the first layer from the header: width and height of the display window,
+/// and column and row of the data window's first pixel. Fails if the data window is not inside the
 /// display window: pixels outside the image have no place in it.
 fn read_windows(path: &Path) -> Result<[(usize, usize); 2], PixelError> {
     let meta = read_header(path)?;

@@ -49,8 +49,8 @@ pub use run_record::{
 };
 pub use text::{
     WARNING, format_amount, format_count, format_duration, format_number, format_size, format_utc,
-    known_names, nearest, print_lines, print_text, printable, report_text, shortened, suggestion,
-    warnings_of, with_warnings,
+    known_names, nearest, print_lines, print_text, printable, report_text, shell_quoted, shortened,
+    suggestion, warnings_of, with_warnings,
 };
 
 /// Returns the current time in seconds since 1970.

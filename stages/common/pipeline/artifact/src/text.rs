@@ -152,6 +152,15 @@ pub fn suggestion<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> S
     nearest(name, known).map_or_else(String::new, |name| format!("did you mean {name}? "))
 }
 
+/// Quotes a word for a POSIX shell where necessary.
+pub fn shell_quoted(word: &str) -> String {
+    let is_plain = word.chars().all(|c| c.is_ascii_alphanumeric() || "_@%+=:,./-".contains(c));
+    if is_plain && !word.is_empty() {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
 /// Prefix of a warning on stderr, in a log and in a summary.
 pub const WARNING: &str = "warning: ";
 
@@ -196,6 +205,20 @@ pub fn format_utc(unix: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn arguments_are_quoted_for_a_shell() {
+        for (argument, quoted) in [
+            ("train-ss", "train-ss"),
+            ("dataset=/data/lego,./x", "dataset=/data/lego,./x"),
+            ("dataset=my scenes/Bäume", "'dataset=my scenes/Bäume'"),
+            ("name=it's $(rm)", r"'name=it'\''s $(rm)'"),
+            ("~/x", "'~/x'"),
+            ("", "''"),
+        ] {
+            assert_eq!(shell_quoted(argument), quoted);
+        }
+    }
 
     struct ClosedPipe;
     impl Write for ClosedPipe {

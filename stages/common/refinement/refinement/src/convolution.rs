@@ -473,8 +473,11 @@ impl Tiles {
     fn blocks_of(maps: &Maps) -> impl Iterator<Item = Self> + use<> {
         let across = maps.width.div_ceil(TILE_OUTPUTS);
         let all = across * maps.height.div_ceil(TILE_OUTPUTS);
-        let count = move |first| BLOCK.min(all - first);
-        (0..all).step_by(BLOCK).map(move |first| Self { first, count: count(first), across })
+        (0..all).step_by(BLOCK).map(move |first| Self {
+            first,
+            count: BLOCK.min(all - first),
+            across,
+        })
     }
 
     /// Returns column and row of a tile's first output.

@@ -201,8 +201,10 @@ impl RefinerTrainer {
             && self.pool.as_ref().is_none_or(|pool| pool.round != round)
         {
             let numbers = round * POOL_VIEWS..(round + 1) * POOL_VIEWS;
-            let view = |number| draw_view(number, &self.options, guidance, examples);
-            self.pool = Some(Pool { round, views: numbers.map(view).collect() });
+            let views = numbers
+                .map(|number| draw_view(number, &self.options, guidance, examples))
+                .collect();
+            self.pool = Some(Pool { round, views });
         }
     }
 

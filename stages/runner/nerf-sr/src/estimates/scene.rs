@@ -218,8 +218,8 @@ fn widths_across(space: &Space, view: &Intrinsics) -> f64 {
         Space::Box => 1.0,
         Space::Contraction => CONTRACTION_WIDTHS,
         Space::Ndc(frustum) => {
-            let side = |axis: usize| frustum.max[axis] - frustum.min[axis];
-            side(0).max(side(1)) * (view.fx / f64::from(view.width))
+            let [width, height] = [0, 1].map(|axis| frustum.max[axis] - frustum.min[axis]);
+            width.max(height) * (view.fx / f64::from(view.width))
         }
     }
 }

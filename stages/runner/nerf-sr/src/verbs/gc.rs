@@ -24,8 +24,12 @@ pub(crate) fn gc(
         return print(&Collection::new(store, root, policy).context(UNREADABLE)?, dry_run, json);
     }
     let stop = stop_on_signals()?;
-    let report = |text: &str| report_line!("nerf-sr: {text}");
-    let closed = wait_for_lock(&stop, "runs look up artifacts", &report, || store.try_close())?;
+    let closed = wait_for_lock(
+        &stop,
+        "runs look up artifacts",
+        &|text| report_line!("nerf-sr: {text}"),
+        || store.try_close(),
+    )?;
     let collection = Collection::new(store, root, policy).context(UNREADABLE)?;
     collection.carry_out(store, &closed)?;
     drop(closed);

@@ -2,10 +2,11 @@
 
 use artifact::{format_count, format_duration, format_size, label, print_line};
 use planning::{Request, short_hash};
+use store::Record;
 
 use super::print_json;
 use crate::estimates::Estimates;
-use crate::planned::{ArtifactReport, PlanReport, age_text};
+use crate::planned::{ArtifactReport, PlanReport, Planned, age_text};
 use crate::session::{Session, nodes_of_stage};
 
 /// Prints what `run` would do.
@@ -47,27 +48,29 @@ pub(crate) fn why(
     if json {
         return print_json(&PlanReport::new(&planned, &records)?.for_stage(stage));
     }
-    let explanation = |index: usize| {
-        let text = planned.state_text(index, Some(&records));
-        format!("{}: {text}", planned.plan.nodes[index].label())
-    };
     if let Some(sink) = planned.plan.sinks.iter().find(|sink| sink.stage == stage) {
         print_line!("{stage}: {}", planned.sink_text(sink));
         for index in sink.nodes() {
-            print_line!("  {}", explanation(index));
+            print_line!("  {}", explanation(&planned, index, &records));
         }
         return Ok(());
     }
     for index in nodes_of_stage(&planned.plan, stage)? {
-        print_line!("{}", explanation(index));
+        print_line!("{}", explanation(&planned, index, &records));
         if let Some(line) = planned.by_scene_text(index) {
             print_line!("    {line}");
         }
         for cause in planned.blocking_nodes(index) {
-            print_line!("  {}", explanation(cause));
+            print_line!("  {}", explanation(&planned, cause, &records));
         }
     }
     Ok(())
+}
+
+/// Returns a node's label, its state and the reason.
+fn explanation(planned: &Planned<'_>, index: usize, records: &[Record]) -> String {
+    let text = planned.state_text(index, Some(records));
+    format!("{}: {text}", planned.plan.nodes[index].label())
 }
 
 /// Prints every stage with its artifact, age and running time.

@@ -43,8 +43,9 @@ pub type Descriptions = BTreeMap<PathBuf, Result<Description, ProgramError>>;
 
 /// Describes programs in parallel. Returns `None` if `stop` is set.
 pub fn describe_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Option<Descriptions> {
-    let describe = |path: &PathBuf| (path.clone(), describe(path, MAX_DESCRIBE_TIME, stop));
-    let descriptions = paths.par_iter().map(describe).collect();
+    let descriptions = (paths.par_iter())
+        .map(|path| (path.clone(), describe(path, MAX_DESCRIBE_TIME, stop)))
+        .collect();
     (!is_set(stop)).then_some(descriptions)
 }
 

@@ -18,7 +18,8 @@ pub(super) struct Tolerance {
 impl Tolerance {
     pub(super) const NONE: Self = Self { extension: false, form: false, case: false };
 
-    /// Returns all tolerances in the order of the attempts: `extension` varies fastest, then `form`.
+    /// Returns all tolerances in the order of the attempts: `extension` varies fastest, then
+    /// `form`.
     pub(super) fn all() -> [Self; 8] {
         [0, 1, 2, 3, 4, 5, 6, 7].map(|bits| Self {
             extension: bits & 1 > 0,

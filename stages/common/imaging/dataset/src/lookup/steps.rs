@@ -30,8 +30,8 @@ pub(super) struct Steps(BTreeMap<Step, (BTreeSet<String>, String)>);
 impl Steps {
     pub(super) fn record(&mut self, name: &str, file: &Path, steps: Vec<Step>) {
         for step in steps {
-            let first = || (BTreeSet::new(), format!("{name} is {}", path_text(file)));
-            let (names, _) = self.0.entry(step).or_insert_with(first);
+            let (names, _) = (self.0.entry(step))
+                .or_insert_with(|| (BTreeSet::new(), format!("{name} is {}", path_text(file))));
             names.insert(name.to_owned());
         }
     }
