@@ -41,11 +41,17 @@ impl ProgramError {
 /// Descriptions, or the errors instead, by the program's path.
 pub type Descriptions = BTreeMap<PathBuf, Result<Description, ProgramError>>;
 
-/// Describes programs in parallel. Returns `None` if `stop` is set.
+/// Describes programs, as many in parallel as this process has processors. Returns `None` if `stop`
+/// is set.
 pub fn describe_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Option<Descriptions> {
-    let descriptions = (paths.par_iter())
-        .map(|path| (path.clone(), describe(path, MAX_DESCRIBE_TIME, stop)))
-        .collect();
+    let describe_one = |path: &PathBuf| (path.clone(), describe(path, MAX_DESCRIBE_TIME, stop));
+    let threads = stage::processors().count.min(paths.len()).max(1);
+    // The global pool hashes inputs; slow programs must not block it.
+    let descriptions = match rayon::ThreadPoolBuilder::new().num_threads(threads).build() {
+        Ok(pool) => pool.install(|| paths.par_iter().map(describe_one).collect()),
+        // The system starts no further thread.
+        Err(_) => paths.iter().map(describe_one).collect(),
+    };
     (!is_set(stop)).then_some(descriptions)
 }
 
@@ -87,6 +93,9 @@ fn run_describe(
     limit: Duration,
     stop: Option<&AtomicBool>,
 ) -> std::io::Result<Option<Output>> {
+    if is_set(stop) {
+        return Ok(None);
+    }
     let mut command = Command::new(path);
     command.arg("describe").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     set_environment(&mut command, &[]);
@@ -175,10 +184,26 @@ mod tests {
             let problem = describe(&path, limit, None).unwrap_err().to_string();
             assert!(problem.contains(expected), "{problem}");
         }
-        let path = write_program(folder.path(), "waits", "#!/bin/sh\nsleep 1000\n");
+    }
+
+    #[test]
+    fn a_signal_ends_a_program_and_starts_no_other() {
+        let folder = tempfile::tempdir().unwrap();
+        let started = folder.path().join("started");
+        let text = format!("#!/bin/sh\n: > '{}'\nsleep 1000\n", started.display());
+        let path = write_program(folder.path(), "waits", &text);
         let stop = AtomicBool::new(true);
         assert!(describe_all(std::slice::from_ref(&path), Some(&stop)).is_none());
-        // Stopped while the program runs.
-        assert!(describe(&path, MAX_DESCRIBE_TIME, Some(&stop)).is_err());
+        assert!(!started.exists());
+        stop.store(false, Ordering::Relaxed);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                while !started.exists() {
+                    std::thread::sleep(POLL_INTERVAL);
+                }
+                stop.store(true, Ordering::Relaxed);
+            });
+            assert!(describe_all(std::slice::from_ref(&path), Some(&stop)).is_none());
+        });
     }
 }
