@@ -54,17 +54,19 @@ impl PageMark {
     }
 }
 
-/// Fails if a folder contains a file that no sink wrote, or that was changed since. An empty folder
-/// passes. `kind` is the kind of the sink's output.
+/// Fails if a folder contains a file that no sink wrote, or that was changed since. A folder
+/// without any entries passes; one that contains only folders fails: a sink didn't create them.
+/// `kind` is the kind of the sink's output.
 pub(crate) fn check_ownership(target: &Path, kind: &str) -> anyhow::Result<()> {
     let is_link = target.symlink_metadata().is_ok_and(|meta| meta.file_type().is_symlink());
     if is_link || !target.is_dir() {
         bail!("{} is not a folder written by nerf-sr", target.display());
     }
-    let files = list_files(target)?;
-    if files.is_empty() {
+    let mut entries = fs::read_dir(target).map_err(|e| unreadable(target, &e))?;
+    if entries.next().is_none() {
         return Ok(());
     }
+    let files = list_files(target)?;
     // The mark decides whether the page is archived, so it must be readable.
     PageMark::read(target).map_err(|e| unreadable(&target.join(MARK_FILE), &e))?;
     let manifest = Manifest::read(target).ok();
@@ -133,8 +135,8 @@ fn can_replace(path: &Path, old: &PageMark, kind: &str) -> bool {
 }
 
 /// Maximum length of the data sets' names in a folder's name in bytes, so that they fit into a file
-/// name; chosen by hand.
-const MAX_NAME_BYTES: usize = 180;
+/// name of 255 bytes next to a stage's name, of 100 bytes at most, and a number; chosen by hand.
+const MAX_NAME_BYTES: usize = 140;
 
 /// Returns a folder name for data sets, from the last components of their paths, without special
 /// characters.
@@ -165,6 +167,6 @@ mod tests {
         assert_eq!(name_of(&["a", "b", "c", "d", "e"]), "a-b-c-d-e");
         assert_eq!(name_of(&["/"]), "data");
         assert_eq!(name_of(&[]), "before");
-        assert_eq!(name_of(&[&"x".repeat(300)]).len(), 180);
+        assert_eq!(name_of(&[&"x".repeat(300)]).len(), 140);
     }
 }

@@ -45,6 +45,15 @@ fn a_page_replaces_a_page() {
     publish_output(dir.path(), "three").unwrap();
 }
 
+#[test]
+fn a_folder_of_empty_folders_is_kept() {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path().join("out/report/plans");
+    fs::create_dir_all(&folder).unwrap();
+    let message = publish_output(dir.path(), "one").unwrap_err().to_string();
+    assert!(message.contains("was not written by nerf-sr") && folder.exists(), "{message}");
+}
+
 /// Creates a data set's page like a sink's output, with one result if the page is complete.
 fn page(dir: &Path, text: &str, data_set: &str, is_complete: bool) -> PathBuf {
     page_of(dir, text, data_set, if is_complete { &["eval"] } else { &[] })
