@@ -430,7 +430,9 @@ fn utf16_is_refused_with_advice_and_a_byte_order_mark_is_accepted() {
     let utf16: Vec<u8> =
         std::iter::once(0xfeff).chain(TINY.encode_utf16()).flat_map(u16::to_le_bytes).collect();
     std::fs::write(project.path("pipeline.yaml"), utf16).unwrap();
-    project.run(&["plan"]).fails(2, &["pipeline.yaml:1: not UTF-8; save it as UTF-8"]);
+    project
+        .run(&["plan"])
+        .fails(2, &["pipeline.yaml:1: not UTF-8 (maybe UTF-16); save it as UTF-8"]);
     project.write("pipeline.yaml", &format!("\u{feff}{}", TINY.replace('\n', "\r\n")));
     project.ok(&["plan"]);
     project.write("pipeline.yaml", "default: [../x]\nstages:\n  ../x: {run: report}\n");

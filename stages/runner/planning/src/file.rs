@@ -201,8 +201,10 @@ pub struct ParsedFile {
 impl ParsedFile {
     /// Parses a pipeline file. Fails on duplicate keys, unknown keys and wrong types.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
-        let text = crate::yaml_lines::decode(bytes)
-            .map_err(|line| PipelineError::new(path, Some(line), "not UTF-8; save it as UTF-8"))?;
+        let text = crate::yaml_lines::decode(bytes).map_err(|line| {
+            let problem = "not UTF-8 (maybe UTF-16); save it as UTF-8";
+            PipelineError::new(path, Some(line), problem)
+        })?;
         let content = parse_content(text, path)?;
         let canonical_path = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
         let file =
@@ -210,8 +212,9 @@ impl ParsedFile {
         for name in file.content.stages.keys() {
             if !is_stage_name(name) {
                 let problem = format!(
-                    "stage {name:?}: choose a name of 1 to {MAX_NAME_BYTES} bytes without `/`, `\\`, \
-                    `..`, white space and control characters that starts with neither `.` nor `-`"
+                    "stage {name:?}: choose a name of 1 to {MAX_NAME_BYTES} bytes without `/`, \
+                    `\\`, `..`, white space and control characters that starts with neither `.` \
+                    nor `-`"
                 );
                 return Err(file.error(&["stages", name], problem));
             }

@@ -15,11 +15,17 @@ use serde::de::{DeserializeSeed, Deserializer, Error, MapAccess, SeqAccess, Visi
 use serde_yaml::Value;
 
 /// Returns the text of a UTF-8 file without its byte order mark. Fails with the line number of the
-/// first invalid byte.
+/// first byte that is invalid or zero.
 pub(crate) fn decode(bytes: &[u8]) -> Result<&str, usize> {
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    std::str::from_utf8(bytes)
-        .map_err(|e| 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count())
+    // Zero is valid UTF-8, but in a text file a sign of UTF-16.
+    let end = bytes.iter().position(|byte| *byte == 0).unwrap_or(bytes.len());
+    let invalid = match std::str::from_utf8(&bytes[..end]) {
+        Ok(text) if end == bytes.len() => return Ok(text),
+        Ok(_) => end,
+        Err(error) => error.valid_up_to(),
+    };
+    Err(1 + bytes[..invalid].iter().filter(|byte| **byte == b'\n').count())
 }
 
 /// Replaces merge keys (`<<: *anchor`) by the entries of their anchors. Returns whether the
@@ -216,8 +222,15 @@ mod tests {
     fn only_utf8_is_decoded() {
         assert_eq!(decode(b"\xef\xbb\xbfa: 1"), Ok("a: 1"));
         assert_eq!(decode("ä: 1\r\n".as_bytes()), Ok("ä: 1\r\n"));
-        for (bytes, line) in [(&b"\xff\xfea\0:\0"[..], 1), (b"a: 1\nb: \xe4\n", 2)] {
-            assert_eq!(decode(bytes), Err(line));
+        for (bytes, line) in [
+            (&b"\xff\xfea\0:\0"[..], 1),
+            (b"\xfe\xff\0a\0:", 1),
+            (b"a\0:\0", 1),
+            (b"\0a\0:", 1),
+            (b"a: 1\nb: \xe4\n", 2),
+            (b"a: 1\nb: \0\n", 2),
+        ] {
+            assert_eq!(decode(bytes), Err(line), "{bytes:?}");
         }
     }
 
