@@ -214,7 +214,8 @@ pub(crate) fn exists(path: &Path) -> io::Result<bool> {
     }
 }
 
-fn remove_folder(path: &Path) -> io::Result<()> {
+/// Removes a folder if it exists.
+pub(crate) fn remove_folder(path: &Path) -> io::Result<()> {
     match fs::remove_dir_all(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
         result => result,

@@ -27,6 +27,8 @@ use half_blocks::half_blocks;
 use look_budget::LookBudget;
 use single_view::WatchedView;
 
+use crate::publish::remove_folder;
+
 /// Interval between two checks of the next look's time.
 const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 /// Time limit of a look as a multiple of its expected time (docs/design/044). Watching ends after a
@@ -105,6 +107,19 @@ fn picture_file_name(label: &str) -> String {
     format!("{}.png", plain.trim_end_matches('_'))
 }
 
+/// Returns `: SCORES (FIELD)` for the summaries of a field and of its scores, without one that is
+/// empty.
+fn summary_text(field: &str, scores: &str) -> String {
+    let mut text = String::new();
+    if !scores.is_empty() {
+        text += &format!(": {scores}");
+    }
+    if !field.is_empty() {
+        text += &format!(" ({field})");
+    }
+    text
+}
+
 /// One look at the latest checkpoint.
 struct Look<'a> {
     watching: &'a Watching<'a>,
@@ -117,8 +132,9 @@ impl Look<'_> {
     /// field, usually because no checkpoint exists yet.
     fn take(&self, training: &Call<'_>) -> anyhow::Result<Option<Duration>> {
         let scratch = &self.watching.scratch;
-        std::fs::remove_dir_all(scratch).ok();
-        std::fs::create_dir_all(scratch).with_context(|| scratch.display().to_string())?;
+        remove_folder(scratch)
+            .and_then(|()| std::fs::create_dir_all(scratch))
+            .with_context(|| scratch.display().to_string())?;
         let [field, views, scores] =
             ["field", "views", "scores"].map(|folder| scratch.join(folder));
         let call =
@@ -127,6 +143,7 @@ impl Look<'_> {
         let Chain { render, score } = self.watching.chain;
         let rendering = self.call_link(render, "render", &field, &views)?;
         let scoring = self.call_link(score, "score", &views, &scores)?;
+        // Stages needn't write a summary.
         let [field, scores] =
             [field, scores].map(|output| read_summary(&output).unwrap_or_default());
         self.show(&views.join(scene::preview_file(&self.view.name)), field.trim(), scores.trim())?;
@@ -149,7 +166,7 @@ impl Look<'_> {
             display.picture(|columns, rows| half_blocks(&image, columns, rows));
         }
         let (view, picture) = (&self.view.name, picture.display());
-        display.line(&format!("{label}: view {view}: {scores} ({field}): {picture}"));
+        display.line(&format!("{label}: view {view}{}: {picture}", summary_text(field, scores)));
         Ok(())
     }
 
@@ -220,7 +237,18 @@ impl Watcher for StopAtDeadline<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::{picture_file_name, scratch_name};
+    use super::{picture_file_name, scratch_name, summary_text};
+
+    #[test]
+    fn missing_summaries_are_left_out() {
+        for (field, scores, expected) in [
+            ("100 rays", "PSNR 20.0", ": PSNR 20.0 (100 rays)"),
+            ("", "PSNR 20.0", ": PSNR 20.0"),
+            ("", "", ""),
+        ] {
+            assert_eq!(summary_text(field, scores), expected);
+        }
+    }
 
     #[test]
     fn labels_become_file_names() {
