@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{Failure, format_duration};
+use artifact::{Failure, format_duration, report_line};
 use store::{Entered, Holder, Locked, Store, StoreError, host_name, is_lock_acquired};
 
 /// Interval between two attempts to lock; chosen by hand.
@@ -52,13 +52,15 @@ pub(crate) fn enter_store(
     wait_for_lock(stop, "garbage is being collected", report, || store.try_enter())
 }
 
-/// Opens and locks a file or folder outside the store; waits while another process holds the lock.
+/// Opens and locks a file or folder; waits while another process holds the lock, and reports this
+/// on stderr. For locks whose holder is unknown.
 pub(crate) fn lock_file(
     path: &Path,
     options: &OpenOptions,
     stop: &AtomicBool,
 ) -> anyhow::Result<File> {
-    wait_for_lock(stop, "another run is writing", &|_| {}, || {
+    let cause = format!("another run has locked {}", path.display());
+    wait_for_lock(stop, &cause, &|text| report_line!("nerf-sr: {text}"), || {
         let file = options
             .open(path)
             .map_err(|source| StoreError::Io { path: path.to_path_buf(), source })?;
@@ -114,6 +116,28 @@ mod tests {
         assert_eq!(crate::exit_code(&failure), 130);
         let text = format!("is in use by process {}; waiting (1.0 s so far)", std::process::id());
         assert_eq!(reports.into_inner(), [text]);
+    }
+
+    #[test]
+    fn a_file_is_locked_by_one_at_a_time() {
+        let dir = tempfile::tempdir().unwrap();
+        let stop = AtomicBool::new(false);
+        let lock = || {
+            let path = dir.path().join("lock");
+            lock_file(&path, File::options().create(true).append(true), &stop)
+        };
+        let held = lock().unwrap();
+        let failure = std::thread::scope(|scope| {
+            let second = scope.spawn(lock);
+            std::thread::sleep(5 * ATTEMPT_INTERVAL);
+            assert!(!second.is_finished(), "the second one waits");
+            stop.store(true, Ordering::Relaxed);
+            second.join().unwrap().unwrap_err()
+        });
+        assert_eq!(crate::exit_code(&failure), 130);
+        drop(held);
+        stop.store(false, Ordering::Relaxed);
+        lock().unwrap();
     }
 
     #[test]

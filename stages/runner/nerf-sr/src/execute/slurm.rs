@@ -51,7 +51,9 @@ impl Cluster {
             is_stopped: &|| run.stop.load(Ordering::Relaxed),
         };
         let lock = slurm::lock_path(root);
-        fs::create_dir_all(root.join("slurm")).with_context(|| lock.display().to_string())?;
+        if let Some(folder) = lock.parent() {
+            fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+        }
         let _lock = lock_file(&lock, File::options().create(true).append(true), run.stop)?;
         let submitted = submission.submit(root, &options, || find_done(run, &out))?;
         self.report(run, &submission, &submitted)
