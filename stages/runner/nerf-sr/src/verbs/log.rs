@@ -1,5 +1,4 @@
-use std::fs::Metadata;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
 use anyhow::Context as _;
@@ -16,7 +15,7 @@ pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::
     let nodes = nodes_of_stage(&plan, stage);
     let logs = nodes.as_ref().map_or(Ok(Vec::new()), |nodes| find_logs(session, &plan, nodes))?;
     for log in &logs {
-        print(log)?;
+        log.print()?;
     }
     if !logs.is_empty() {
         return Ok(());
@@ -31,17 +30,23 @@ pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::
         "{stage}: no log for these arguments; this is the log of its last run, {}",
         format_utc(unix)
     );
-    print(&log)
+    log.print()
 }
 
-/// Label and path of the log of one node.
-type NodeLog = (String, PathBuf);
+/// Log of one node.
+struct NodeLog {
+    /// Stage and point of the node.
+    label: String,
+    path: PathBuf,
+}
 
-fn print((label, path): &NodeLog) -> anyhow::Result<()> {
-    let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
-    print_line!("{label} ({}):", path.display());
-    print_lines(&String::from_utf8_lossy(&bytes));
-    Ok(())
+impl NodeLog {
+    fn print(&self) -> anyhow::Result<()> {
+        let bytes = std::fs::read(&self.path).with_context(|| self.path.display().to_string())?;
+        print_line!("{} ({}):", self.label, self.path.display());
+        print_lines(&String::from_utf8_lossy(&bytes));
+        Ok(())
+    }
 }
 
 /// Finds the existing logs of nodes: for each node, the stage's log and that of the newest job.
@@ -61,7 +66,7 @@ fn find_logs(session: &Session, plan: &Plan, nodes: &[usize]) -> anyhow::Result<
         });
         let job_log = job_logs.get(node).cloned().flatten();
         for path in [stage_log, job_log].into_iter().flatten().filter(|path| path.is_file()) {
-            logs.push((plan.nodes[node].label(), path));
+            logs.push(NodeLog { label: plan.nodes[node].label(), path });
         }
     }
     Ok(logs)
@@ -84,22 +89,29 @@ fn unfinished_log(store: &Store, key: &str) -> PathBuf {
 }
 
 /// Finds the log of a stage's last run, finished or not, with any arguments. Returns the time of
-/// its last output, in seconds since 1970, and the log.
+/// its end, or of its last output if it is unfinished, in seconds since 1970, and the log.
 fn find_last_log(store: &Store, stage: &str) -> Result<Option<(u64, NodeLog)>, StoreError> {
-    let mut actions = Vec::new();
-    for record in store.records()? {
-        actions.push((store.action(&record.key(), "log"), record.stage, record.point));
+    let mut logs = Vec::new();
+    for record in store.records()?.into_iter().filter(|record| record.stage == stage) {
+        // A log's own time may be that of a copy of the store.
+        let ended_unix = record.started_unix.saturating_add(record.seconds as u64);
+        let path = store.action(&record.key(), "log");
+        logs.push((ended_unix, NodeLog { label: label(&record.stage, &record.point), path }));
     }
     for key in store.partials()? {
-        if let Some(action) = store.unfinished(&key)? {
-            actions.push((unfinished_log(store, &key), action.stage, action.point));
+        let path = unfinished_log(store, &key);
+        if let Some(action) = store.unfinished(&key)?.filter(|action| action.stage == stage)
+            && let Some(unix) = modified_unix(&path)
+        {
+            logs.push((unix, NodeLog { label: label(&action.stage, &action.point), path }));
         }
     }
-    actions.retain(|(_, other, _)| other == stage);
-    let logs = actions.into_iter().filter_map(|(path, stage, point)| {
-        let time = path.metadata().ok().filter(Metadata::is_file)?.modified().ok()?;
-        let unix = time.duration_since(UNIX_EPOCH).ok()?.as_secs();
-        Some((unix, (label(&stage, &point), path)))
-    });
-    Ok(logs.max_by_key(|(unix, _)| *unix))
+    logs.retain(|(_, log)| log.path.is_file());
+    Ok(logs.into_iter().max_by_key(|(unix, _)| *unix))
+}
+
+/// Returns a file's modification time in seconds since 1970; `None` if unknown.
+fn modified_unix(path: &Path) -> Option<u64> {
+    let time = path.metadata().ok()?.modified().ok()?;
+    Some(time.duration_since(UNIX_EPOCH).ok()?.as_secs())
 }
