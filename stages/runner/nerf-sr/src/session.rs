@@ -180,9 +180,14 @@ pub(crate) fn nodes_of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, Pla
             "{stage} is a sink, which displays runs and has no artifact"
         )));
     }
-    let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
-    let known = artifact::known_names(stage, known);
+    let known = known_stages(plan, stage);
     Err(PlanError::Usage(format!("no stage {stage:?} in this plan; {known}")))
+}
+
+/// Returns the end of a message about an unknown stage: the stages that have artifacts.
+fn known_stages(plan: &Plan, unknown: &str) -> String {
+    let known: BTreeSet<&str> = plan.nodes.iter().map(|node| node.stage.as_str()).collect();
+    artifact::known_names(unknown, known)
 }
 
 /// Computes identities of nodes whose keys may not be known yet: hashes of the key's parts, with
@@ -232,7 +237,11 @@ fn with_artifact_folders(
         let mut earlier = Request { targets: vec![stage.to_owned()], ..resolved.clone() };
         earlier.inputs.remove(index);
         let plan = new_plan(&Request { parameters: Vec::new(), ..earlier.clone() })?;
-        let names = plan.nodes[nodes_of_stage(&plan, stage)?[0]].program.schema.names();
+        let node = plan.nodes.iter().find(|node| node.stage == stage).ok_or_else(|| {
+            let known = known_stages(&plan, stage);
+            PlanError::Usage(format!("-i {input}: {stage} has no artifact; {known}"))
+        })?;
+        let names = node.program.schema.names();
         earlier.parameters.retain(|text| !is_of_stage(text, stage, &names));
         let folder = artifact_folder(store, &new_plan(&earlier)?, stage, input)?;
         resolved.inputs[index] = format!("{name}={folder}");
@@ -267,7 +276,36 @@ fn is_of_stage(text: &str, stage: &str, names: &[&str]) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
+
+    #[test]
+    fn an_input_from_a_stage_without_an_artifact_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let pipeline = "default: [make]\nstages: {make: {}, show: {inputs: {run: make}}}";
+        let pipeline = Pipeline::parse(pipeline.as_bytes(), Path::new("pipeline.yaml")).unwrap();
+        let mut descriptions = BTreeMap::new();
+        for (name, is_sink) in [("make", false), ("show", true)] {
+            let inputs =
+                if is_sink { json!({"run": {"kinds": ["run"], "summary": ""}}) } else { json!({}) };
+            let description = serde_json::from_value(json!({"name": name, "version": "",
+                "code": "", "summary": "", "parameters": {}, "output": {"kind": "x"},
+                "inputs": inputs, "sink": is_sink}));
+            descriptions.insert(name.to_owned(), description.unwrap());
+        }
+        let new_plan =
+            |request: &Request| Plan::from_descriptions(&pipeline, &descriptions, request);
+        for (input, message) in [
+            ("init=show", "-i init=show: show has no artifact; known: make"),
+            ("init=make", "-i init=make: make has no artifact yet; run it first: nerf-sr run make"),
+        ] {
+            let request = Request { inputs: vec![input.to_owned()], ..Request::default() };
+            let error = with_artifact_folders(&pipeline, &store, &request, new_plan).unwrap_err();
+            assert_eq!(error.to_string(), message);
+        }
+    }
 
     #[test]
     fn arguments_are_matched_to_their_stage() {
