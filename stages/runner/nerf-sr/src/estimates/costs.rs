@@ -13,11 +13,20 @@ use workload::{export_bytes, export_scale, program_bytes};
 use super::work::Work;
 use training::{field_factor, training_memory, training_need, training_seconds};
 
-/// Seconds per rendered ray, and fraction of the pixels that get all rays at the default tolerance,
-/// which is taken for any tolerance above 0: of objects and of opaque scenes
-/// (docs/results/engine.md).
-const OBJECT_RENDERING: (f64, f64) = (4.4e-6, 0.23);
-const OPAQUE_RENDERING: (f64, f64) = (8e-6, 0.29);
+/// Costs of rendering a kind of scene.
+#[derive(Clone, Copy)]
+struct RenderingCosts {
+    /// Seconds per rendered ray.
+    ray_seconds: f64,
+    /// Fraction of the pixels that get all rays at the default tolerance, which is taken for any
+    /// tolerance above 0.
+    detailed_share: f64,
+}
+
+/// Costs of rendering objects and opaque scenes (docs/results/engine.md).
+const OBJECT_RENDERING: RenderingCosts =
+    RenderingCosts { ray_seconds: 4.4e-6, detailed_share: 0.23 };
+const OPAQUE_RENDERING: RenderingCosts = RenderingCosts { ray_seconds: 8e-6, detailed_share: 0.29 };
 /// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
 const RENDERED_BYTES_PER_FLOAT: u64 = 7;
 /// Bytes of `render-depth` without its field and libtorch, but with the rays of a band of rows; as
@@ -26,10 +35,18 @@ const RENDERER_BYTES: u64 = 28_000_000;
 /// Bytes of any other program that can contain libtorch, without it and data; as in the tests
 /// below.
 const PROGRAM_BYTES: u64 = 5_000_000;
-/// Seconds and bytes per pixel of a view that `eval` scores, without and with LPIPS: lego 100×2, 12
-/// views.
-const SCORED_PIXEL: (f64, u64) = (1.4e-6, 125);
-const LPIPS_PIXEL: (f64, u64) = (2.2e-6, 580);
+/// Costs of scoring a view by `eval`.
+#[derive(Clone, Copy)]
+struct ScoringCosts {
+    /// Seconds per pixel.
+    pixel_seconds: f64,
+    /// Bytes per pixel.
+    pixel_bytes: u64,
+}
+
+/// Costs of scoring without and with LPIPS: lego 100×2, 12 views.
+const SCORING: ScoringCosts = ScoringCosts { pixel_seconds: 1.4e-6, pixel_bytes: 125 };
+const LPIPS_SCORING: ScoringCosts = ScoringCosts { pixel_seconds: 2.2e-6, pixel_bytes: 580 };
 /// Seconds per photograph's pixel of `prep`.
 const PREPARED_PIXEL_SECONDS: f64 = 30e-9;
 /// Bytes of `prep` without data, and peak memory of each further thread over that of the first:
@@ -123,21 +140,25 @@ fn prep_memory(work: &Work) -> u64 {
     PREP_BYTES + (views * work.preparation_bytes as f64) as u64
 }
 
+fn rendering_costs(work: &Work) -> RenderingCosts {
+    if work.kind.is_opaque() { OPAQUE_RENDERING } else { OBJECT_RENDERING }
+}
+
 fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
-    let (ray, detailed) = if work.kind.is_opaque() { OPAQUE_RENDERING } else { OBJECT_RENDERING };
+    let RenderingCosts { ray_seconds, detailed_share } = rendering_costs(work);
     let field = work.field.as_ref()?;
     if field["field"] == "mlp" {
         return None;
     }
     let detailed = if number(parameters, "tolerance")? > 0.0 {
-        detailed * work.resolved_part(field)?
+        detailed_share * work.resolved_part(field)?
     } else {
         1.0
     };
     let samples = number(parameters, "samples_per_axis")?;
     let further = if samples > 1.0 { samples.powi(2) } else { 0.0 };
     let rays = work.images.pixels as f64 * (1.0 + detailed * further);
-    Some(number(field, "ensemble")? * rays * ray * field_factor(field, work.kind)?)
+    Some(number(field, "ensemble")? * rays * ray_seconds * field_factor(field, work.kind)?)
 }
 
 fn rendering_memory(work: &Work) -> Option<u64> {
@@ -147,9 +168,9 @@ fn rendering_memory(work: &Work) -> Option<u64> {
 }
 
 fn scoring(work: &Work) -> (f64, u64) {
-    let (seconds, bytes) = if work.computes_lpips { LPIPS_PIXEL } else { SCORED_PIXEL };
-    let memory = torch_program_bytes(work) + concurrent_bytes(work, bytes);
-    (work.images.pixels as f64 * seconds, memory)
+    let costs = if work.computes_lpips { LPIPS_SCORING } else { SCORING };
+    let memory = torch_program_bytes(work) + concurrent_bytes(work, costs.pixel_bytes);
+    (work.images.pixels as f64 * costs.pixel_seconds, memory)
 }
 
 fn refiner_training(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
@@ -178,9 +199,8 @@ fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let has_mesh = parameters["mesh"] == true;
     let nodes = if has_mesh { (number(parameters, "resolution")? + 1.0).powi(3) } else { 0.0 };
     let bytes = export_bytes(pixels, nodes as u64);
-    let (ray, _) = if work.kind.is_opaque() { OPAQUE_RENDERING } else { OBJECT_RENDERING };
     let field = work.field.as_ref()?;
-    let seconds = number(field, "ensemble")? * pixels as f64 * ray;
+    let seconds = number(field, "ensemble")? * pixels as f64 * rendering_costs(work).ray_seconds;
     Some((seconds, rendering_memory(work)? + bytes))
 }
 

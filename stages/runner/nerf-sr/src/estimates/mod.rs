@@ -16,7 +16,7 @@ mod work;
 use std::collections::BTreeMap;
 
 use planning::{Node, Origin, Plan, State, nearest_record};
-use serde_json::Value;
+use serde_json::{Map, Value, json};
 use store::{ModelCost, Record, Store, host_name};
 
 pub(crate) use text::{check_memory, comparison_text, run_text, total_comparison_text};
@@ -134,7 +134,7 @@ impl<'a> Estimator<'a> {
         let program = node.program.description.name.as_str();
         let known_parts = match state {
             State::WillRun { key_parts } => key_parts.clone(),
-            _ => planning::key_parts(node, &[], self.plan.device(&node.stage)),
+            _ => partial_key_parts(node),
         };
         let similar = self.records.iter().filter(|record| {
             let Some(other) = record.model else { return false };
@@ -222,6 +222,17 @@ impl<'a> Estimator<'a> {
         };
         Some((index, frames?))
     }
+}
+
+/// Returns the parts of a node's key that are known while inputs are unknown: the program and the
+/// parameters.
+fn partial_key_parts(node: &Node) -> Map<String, Value> {
+    let partial = node.partial_key();
+    let parameters = partial.parameters.into_iter();
+    let mut parts: Map<String, Value> =
+        parameters.map(|(name, value)| (format!("parameter {name}"), value)).collect();
+    parts.insert("stage".to_owned(), json!(partial.program));
+    parts
 }
 
 /// Returns the factors by which the model's time and memory are corrected after an earlier run.

@@ -43,7 +43,7 @@ impl Local {
         if let Some(text) = run_text(plan, run.estimates, self.budget.cores) {
             report_text(&format!("nerf-sr: {text}"));
         }
-        let (progress, skipped) = run_nodes(run, self);
+        let NodesOutcome { progress, skipped } = run_nodes(run, self);
         if run.stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
         }
@@ -63,12 +63,12 @@ impl Local {
             return Ok(ExitCode::from(failure.code));
         }
         print_summaries(run, &progress);
-        let (has_written, first_failure) = self.run_sinks(run, plan.sinks.iter(), &progress)?;
-        if let Some(code) = first_failure {
+        let sinks = self.run_sinks(run, plan.sinks.iter(), &progress)?;
+        if let Some(code) = sinks.first_failure {
             return Ok(ExitCode::from(code));
         }
         let ran = progress.ran.iter().flatten();
-        let end = end_message(ran.clone().count(), plan.nodes.len(), has_written);
+        let end = end_message(ran.clone().count(), plan.nodes.len(), sinks.has_written);
         let ran = ran.filter_map(|&index| Some((index, progress.records[index].as_ref()?)));
         let comparison = total_comparison_text(run.estimates, ran);
         print_line!("{end}{}", comparison.map_or_else(String::new, |text| format!("; {text}")));
@@ -83,36 +83,50 @@ impl Local {
         command_text([program, "log", stage].into_iter().chain(arguments))
     }
 
-    /// Runs sinks, and prints the paths of their pages and their failures. Returns whether a page
-    /// was written, and the exit code of the first sink that failed.
+    /// Runs sinks, and prints the paths of their pages and their failures.
     fn run_sinks<'a>(
         &self,
         run: &Run<'_>,
         sinks: impl Iterator<Item = &'a Sink>,
         progress: &RunProgress,
-    ) -> anyhow::Result<(bool, Option<u8>)> {
-        let (mut any_written, mut first_failure) = (false, None);
+    ) -> anyhow::Result<SinksOutcome> {
+        let mut outcome = SinksOutcome::default();
         for sink in sinks {
             let result = run_sink(run, sink, self.budget.cores, progress);
             if run.stop.load(Ordering::Relaxed) {
                 return Err(Failure::Interrupted.into());
             }
             match result {
-                Ok(is_written) => any_written |= is_written,
+                Ok(is_written) => outcome.has_written |= is_written,
                 Err(error) => {
                     let StageFailure { code, message } = stage_failure(&error);
                     report_line!("nerf-sr: {}: {message}", sink.stage);
-                    first_failure.get_or_insert(code);
+                    outcome.first_failure.get_or_insert(code);
                 }
             }
         }
-        Ok((any_written, first_failure))
+        Ok(outcome)
     }
 }
 
-/// Runs the nodes. Returns their progress, and the number of nodes that were skipped because of
-/// failures.
-fn run_nodes(run: &Run<'_>, options: &Local) -> (RunProgress, usize) {
+/// Outcome of a run's sinks.
+#[derive(Default)]
+struct SinksOutcome {
+    /// True if a page was written.
+    has_written: bool,
+    /// Exit code of the first sink that failed.
+    first_failure: Option<u8>,
+}
+
+/// Outcome of a run's nodes.
+struct NodesOutcome {
+    /// Records of the nodes, and their failures.
+    progress: RunProgress,
+    /// Number of nodes that were skipped because of failures.
+    skipped: usize,
+}
+
+fn run_nodes(run: &Run<'_>, options: &Local) -> NodesOutcome {
     let display = Display::default();
     let count = run.plan.nodes.len();
     let mut schedule = Schedule {
@@ -147,7 +161,7 @@ fn run_nodes(run: &Run<'_>, options: &Local) -> (RunProgress, usize) {
         }
     });
     let skipped = schedule.pending.len() + schedule.ready.len();
-    (schedule.progress, skipped)
+    NodesOutcome { progress: schedule.progress, skipped }
 }
 
 /// Progress of a run's nodes.

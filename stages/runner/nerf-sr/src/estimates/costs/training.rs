@@ -8,13 +8,26 @@ use workload::{PixelStorage, RayBudget, TrainingMemory, grid_training_bytes, pro
 use super::number;
 use crate::estimates::work::{SceneKind, Work};
 
-/// Seconds per training ray late in a training, without those per step; samples of such a ray; and
-/// seconds per step of any size. Measured on lego 100×2, fern 252×2 and the demo scene with
-/// backdrop (docs/results/engine.md), steps with 6,144 to 24,576 `samples_per_step`. More cells of
-/// a frustum are occupied, and its tables are larger.
-const OBJECT: (f64, f64, f64) = (10.8e-6, 22.0, 3.3e-3);
-const FRUSTUM: (f64, f64, f64) = (22e-6, 36.0, 8.3e-3);
-const UNBOUNDED: (f64, f64, f64) = (20e-6, 36.0, 3.3e-3);
+/// Costs of training in a kind of scene.
+#[derive(Clone, Copy)]
+struct TrainingCosts {
+    /// Seconds per training ray late in a training, without those per step.
+    ray_seconds: f64,
+    /// Samples of a ray late in a training.
+    ray_samples: f64,
+    /// Seconds per step of any size.
+    step_seconds: f64,
+}
+
+/// Costs measured on lego 100×2, fern 252×2 and the demo scene with backdrop, with steps of 6,144
+/// to 24,576 samples (docs/results/engine.md). More cells of a frustum are occupied, and its tables
+/// are larger.
+const OBJECT: TrainingCosts =
+    TrainingCosts { ray_seconds: 10.8e-6, ray_samples: 22.0, step_seconds: 3.3e-3 };
+const FRUSTUM: TrainingCosts =
+    TrainingCosts { ray_seconds: 22e-6, ray_samples: 36.0, step_seconds: 8.3e-3 };
+const UNBOUNDED: TrainingCosts =
+    TrainingCosts { ray_seconds: 20e-6, ray_samples: 36.0, step_seconds: 3.3e-3 };
 /// Exponents by which a ray's cost grows with `march_steps` and `hidden_dim`: 0.58 and 0.68 of the
 /// time at half of either (docs/design/008).
 const STEPS_EXPONENT: f64 = 0.8;
@@ -73,14 +86,14 @@ pub(super) fn training_seconds(parameters: &Value, work: &Work) -> Option<f64> {
         // The number of first steps hardly depends on their size.
         fields * first_steps(rays / fields) * step_samples / DEFAULT_STEP_SAMPLES
     };
-    let (ray, ray_samples, step) = match work.kind {
+    let TrainingCosts { ray_seconds, ray_samples, step_seconds } = match work.kind {
         SceneKind::Object => OBJECT,
         SceneKind::Frustum => FRUSTUM,
         SceneKind::Unbounded => UNBOUNDED,
     };
     let (samples, sample) = field_factors(parameters, work.kind)?;
     let steps = (samples * rays + first_steps) * ray_samples / (STEP_GROWTH * step_samples);
-    Some(ray * (samples * sample * rays + first_steps) + step * steps)
+    Some(ray_seconds * (samples * sample * rays + first_steps) + step_seconds * steps)
 }
 
 /// Returns the extra cost of the first steps of a training of one field, as a number of rays late
