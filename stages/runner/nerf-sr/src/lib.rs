@@ -59,11 +59,13 @@ pub fn main() -> ExitCode {
     })
 }
 
-/// Returns the exit code of an error, by the first cause that has one.
+/// Returns the exit code of an error: that of the first [`PlanError`] or [`StageFailure`] in the
+/// error's chain, otherwise that of [`artifact::exit_code`].
 fn exit_code(error: &anyhow::Error) -> u8 {
-    let plan_error = error.chain().find_map(|e| e.downcast_ref::<PlanError>());
-    let stage_failure = error.chain().find_map(|e| e.downcast_ref::<StageFailure>());
-    let code = plan_error.map(plan_exit_code).or(stage_failure.map(|failure| failure.code));
+    let code = error.chain().find_map(|cause| {
+        let failure = cause.downcast_ref::<StageFailure>().map(|failure| failure.code);
+        failure.or_else(|| cause.downcast_ref::<PlanError>().map(plan_exit_code))
+    });
     code.unwrap_or_else(|| artifact::exit_code(error))
 }
 

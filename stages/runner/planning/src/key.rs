@@ -1,5 +1,6 @@
-//! Key of an action: the hash of one flat list of parts. `why` reports differences between such
-//! lists, so that its explanation always agrees with the key (docs/design/002).
+//! Key of an action: the hash of one flat list of parts; and differences between two such lists, or
+//! other maps of named values. `why` reports them, so that its explanation always agrees with the
+//! key (docs/design/002).
 
 use std::cmp::Reverse;
 use std::collections::BTreeSet;

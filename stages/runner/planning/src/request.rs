@@ -19,13 +19,14 @@ pub struct Request {
     pub selection: Selection,
 }
 
-/// Error returned when there is no plan, or its states can't be found.
+/// Error returned when there is no plan, its states can't be found, or a program isn't the planned
+/// one.
 #[derive(Debug, thiserror::Error)]
 pub enum PlanError {
     /// A pipeline file is invalid.
     #[error(transparent)]
     Pipeline(#[from] PipelineError),
-    /// The command line is invalid.
+    /// The command line or a stage's program is invalid.
     #[error("{0}")]
     Usage(String),
     /// A folder outside the store can't be used.
