@@ -64,7 +64,10 @@ impl<'a> Inputs<'a> {
 
     /// Fails if an input was changed since its content was hashed.
     pub(crate) fn check(&self, stop: &AtomicBool) -> anyhow::Result<()> {
-        Ok(self.find_change(Some(stop))?.map_or(Ok(()), Err)?)
+        match self.find_change(Some(stop))? {
+            None => Ok(()),
+            Some(change) => Err(change.into()),
+        }
     }
 
     /// Checks the inputs like [`Self::check`] after the stage's end. If an input was changed,

@@ -27,6 +27,12 @@ impl Memory {
     pub fn bytes(self) -> u64 {
         self.mib.saturating_mul(1 << 20)
     }
+
+    /// Parses one number with its unit: Slurm knows no sums of memory.
+    fn parse(text: &str) -> Option<u64> {
+        let has_one_unit = text.chars().filter(|c| !c.is_ascii_digit()).count() == 1;
+        parse_sum(text, &MEMORY_UNITS).filter(|_| has_one_unit)
+    }
 }
 
 impl Period {
@@ -34,11 +40,15 @@ impl Period {
     pub(crate) fn minutes(self) -> u64 {
         self.seconds.div_ceil(60)
     }
+
+    fn parse(text: &str) -> Option<u64> {
+        parse_sum(text, &PERIOD_UNITS)
+    }
 }
 
 /// Parses numbers with units, larger units first, to a sum; `None` for other texts and for 0, which
 /// Slurm reads as all memory of a node.
-fn parse(text: &str, units: &[(char, u64)]) -> Option<u64> {
+fn parse_sum(text: &str, units: &[(char, u64)]) -> Option<u64> {
     let mut units = units.iter();
     let mut sum = 0u64;
     for piece in text.split_inclusive(|c: char| !c.is_ascii_digit()) {
@@ -74,14 +84,14 @@ impl Display for Period {
     }
 }
 
-// Implements parsing, and serde's traits by parsing and `Display`.
-macro_rules! text_form {
-    ($type:ident { $field:ident }, $units:ident, $name:literal, $units_and_example:literal) => {
+// Implements `FromStr` by the type's own `parse`, and serde's traits by `FromStr` and `Display`.
+macro_rules! impl_text_conversions {
+    ($type:ident { $field:ident }, $name:literal, $units_and_example:literal) => {
         impl FromStr for $type {
             type Err = SlurmError;
 
             fn from_str(text: &str) -> Result<Self, SlurmError> {
-                let $field = parse(text, &$units).ok_or_else(|| {
+                let $field = Self::parse(text).ok_or_else(|| {
                     let remedy = concat!("write a number with ", $units_and_example);
                     SlurmError(format!("invalid {} {text:?}; {remedy}", $name))
                 })?;
@@ -112,8 +122,8 @@ macro_rules! text_form {
         }
     };
 }
-text_form!(Memory { mib }, MEMORY_UNITS, "amount of memory", "M, G or T, such as 8G");
-text_form!(Period { seconds }, PERIOD_UNITS, "duration", "d, h, m or s, such as 2h or 1h30m");
+impl_text_conversions!(Memory { mib }, "amount of memory", "M, G or T, such as 8G");
+impl_text_conversions!(Period { seconds }, "duration", "d, h, m or s, such as 2h or 1h30m");
 
 #[cfg(test)]
 mod tests {
@@ -131,9 +141,20 @@ mod tests {
             let memory: Memory = text.parse().unwrap();
             assert_eq!((memory.mib, memory.to_string().as_str()), (mib, formatted));
         }
-        for text in
-            ["", "G", "8", "0G", "-8G", "8GB", "8g", "1.5G", "8 G", "18446744073709551615T", "８G"]
-        {
+        for text in [
+            "",
+            "G",
+            "8",
+            "0G",
+            "-8G",
+            "8GB",
+            "8g",
+            "1.5G",
+            "8 G",
+            "1G512M",
+            "18446744073709551615T",
+            "８G",
+        ] {
             let problem = text.parse::<Memory>().unwrap_err().to_string();
             assert!(problem.contains("such as 8G"), "{text}: {problem}");
         }

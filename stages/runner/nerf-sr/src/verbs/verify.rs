@@ -55,9 +55,9 @@ impl Verification<'_> {
     /// counts only if the object still exists after entering the store.
     fn check_object(&mut self, identity: &str) -> anyhow::Result<()> {
         let mut result = self.store.verify(identity);
-        let _entered;
-        if result.is_err() {
-            _entered = self.enter()?;
+        // Garbage collection waits as long as this exists.
+        let entered = if result.is_err() { Some(self.enter()?) } else { None };
+        if entered.is_some() {
             if matches!(exists(&self.store.object(identity)), Ok(false)) {
                 return Ok(());
             }
