@@ -32,6 +32,46 @@ const MAX_CHAINED_FILES: usize = 8;
 pub(crate) const TARGET_FOLDERS: [&str; 2] = ["pipelines", "experiments"];
 
 impl Pipeline {
+    /// Reads a pipeline file and the files that it extends.
+    pub fn read(path: &Path) -> Result<Self, PipelineError> {
+        let bytes = std::fs::read(path).map_err(|e| {
+            let problem = format!(
+                "{e}; run in the folder of pipeline.yaml, name it with --pipeline, or write one \
+                with `nerf-sr init DIR`"
+            );
+            PipelineError::new(path, None, problem)
+        })?;
+        Self::parse(&bytes, path)
+    }
+
+    /// Parses a pipeline file and reads the files that it extends. `path` locates the file for
+    /// relative paths and error messages.
+    pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
+        let file = ParsedFile::parse(bytes, path)?;
+        let mut chain = vec![file.canonical_path.clone()];
+        read_extended(file, &mut chain)
+    }
+
+    /// Joins two pipelines. Fails with the problem if blocks of the same name differ. Default
+    /// targets come from `self`. If both set the quality, `self` wins. If both set a part of the
+    /// experiment, `other` wins.
+    pub(crate) fn joined(mut self, other: Self) -> Result<Self, String> {
+        let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
+        if let Some(name) = shared.find(|name| !self.has_equal_block(&other, name)) {
+            let files = [&self, &other].map(|joined| joined.file_of_block(name).path.display());
+            return Err(format!("block {name} differs in {} and in {}", files[0], files[1]));
+        }
+        self.stages.extend(other.stages);
+        self.experiment.override_with(&other.experiment);
+        self.quality = self.quality.or(other.quality);
+        for file in other.files {
+            if !self.files.iter().any(|known| known.canonical_path == file.canonical_path) {
+                self.files.push(file);
+            }
+        }
+        Ok(self)
+    }
+
     /// Returns the names of the blocks that set a stage's parameters: the extended block, if any,
     /// then the stage's own block, which overrides the extended one.
     pub fn layers<'a>(&'a self, stage: &'a str) -> impl Iterator<Item = &'a str> {
@@ -131,48 +171,6 @@ fn is_target_folder(folder: &Path) -> bool {
     TARGET_FOLDERS.iter().any(|name| folder.ends_with(name))
 }
 
-impl Pipeline {
-    /// Reads a pipeline file and the files that it extends.
-    pub fn read(path: &Path) -> Result<Self, PipelineError> {
-        let bytes = std::fs::read(path).map_err(|e| {
-            let problem = format!(
-                "{e}; run in the folder of pipeline.yaml, name it with --pipeline, or write one \
-                with `nerf-sr init DIR`"
-            );
-            PipelineError::new(path, None, problem)
-        })?;
-        Self::parse(&bytes, path)
-    }
-
-    /// Parses a pipeline file and reads the files that it extends. `path` locates the file for
-    /// relative paths and error messages.
-    pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
-        let file = ParsedFile::parse(bytes, path)?;
-        let mut chain = vec![file.canonical_path.clone()];
-        read_extended(file, &mut chain)
-    }
-
-    /// Joins two pipelines. Fails with the problem if blocks of the same name differ. Default
-    /// targets come from `self`. If both set the quality, `self` wins. If both set a part of the
-    /// experiment, `other` wins.
-    pub(crate) fn joined(mut self, other: Self) -> Result<Self, String> {
-        let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
-        if let Some(name) = shared.find(|name| !self.has_equal_block(&other, name)) {
-            let files = [&self, &other].map(|joined| joined.file_of_block(name).path.display());
-            return Err(format!("block {name} differs in {} and in {}", files[0], files[1]));
-        }
-        self.stages.extend(other.stages);
-        self.experiment.override_with(&other.experiment);
-        self.quality = self.quality.or(other.quality);
-        for file in other.files {
-            if !self.files.iter().any(|known| known.canonical_path == file.canonical_path) {
-                self.files.push(file);
-            }
-        }
-        Ok(self)
-    }
-}
-
 /// Joins the files that a file extends, then applies this file's own blocks over them. In `chain`,
 /// each file extends the next; the last one is this file.
 fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineError> {
@@ -244,5 +242,5 @@ fn display_path(path: &Path) -> PathBuf {
 }
 
 #[cfg(test)]
-#[path = "extend_tests.rs"]
+#[path = "pipeline_tests.rs"]
 mod tests;

@@ -85,10 +85,25 @@ fn draw_for_graphviz(vertices: &[Vertex]) -> String {
     let mut text = "digraph pipeline {\n  rankdir=LR;\n  node [shape=box];\n".to_owned();
     for (i, vertex) in vertices.iter().enumerate() {
         let shape = if vertex.is_sink { ", shape=note" } else { "" };
-        text += &format!("  n{i} [label={:?}{shape}];\n", vertex.label);
+        text += &format!("  n{i} [label={}{shape}];\n", quoted(&vertex.label));
         for (parent, subtree) in &vertex.parents {
-            text += &format!("  n{parent} -> n{i} [label={subtree:?}];\n");
+            text += &format!("  n{parent} -> n{i} [label={}];\n", quoted(subtree));
         }
     }
     text + "}\n"
+}
+
+/// Quotes a text for Graphviz, which knows fewer escapes than Rust.
+fn quoted(text: &str) -> String {
+    format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\""))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn labels_are_quoted_for_graphviz() {
+        assert_eq!(quoted("a \"b\" \\ e\u{301}"), "\"a \\\"b\\\" \\\\ e\u{301}\"");
+    }
 }
