@@ -79,7 +79,8 @@ pub(crate) fn find_roots(
     }
     for (key, record) in &contents.records {
         if policy.is_recent(record.started_unix) {
-            let reason = format!("created {}", age_text(record.started_unix));
+            // The list of artifacts has their ages.
+            let reason = format!("younger than --keep-days {}", policy.keep_days);
             roots.push(action_root(reason, key));
         }
         if !policy.drop_old && record.has_old_key() {

@@ -377,6 +377,18 @@ fn old_action(content: u8) -> Action {
     Action { stage: 0, parameter: 0, inputs: vec![], content, days_old: 90, state: State::Finished }
 }
 
+#[test]
+fn a_recent_artifact_is_listed_with_its_age() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Store::open(dir.path()).unwrap();
+    let parts = json!({KEY_VERSION_PART: KEY_VERSION}).as_object().unwrap().clone();
+    make_action(&store, &Action { days_old: 3, ..old_action(1) }, &parts, &[]);
+    let policy = Policy { keep_days: 7, drop_unfinished: false, drop_old: false };
+    let collection = Collection::new(&store, Root::default(), policy).unwrap();
+    let line = collection.decisions()[0].to_string();
+    assert!(line.ends_with("created 3 days ago: keep: younger than --keep-days 7"), "{line}");
+}
+
 /// An artifact with a key of an older version is kept, with its inputs, unless `drop_old` is set.
 #[test]
 fn artifacts_of_older_versions_are_kept_until_dropped() {
