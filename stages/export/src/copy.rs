@@ -28,7 +28,7 @@ impl Stage for CopyFiles {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        Input::run(
+        Input::of_sink(
             "in pipeline.yaml: a block whose artifact is copied; nerf-sr passes a folder with its \
             record, run.json",
         )

@@ -22,12 +22,13 @@ pub enum SpaceKind {
     Contraction,
 }
 
-// Reasons why a requested space doesn't suit the cameras.
-const NO_DEPTHS: &str = "parameter space: ndc requires the depth range of each view, which the data \
-    set lacks; give near and far, or choose box";
-const IS_FISHEYE: &str = "parameter space: ndc cannot contain the view of a fisheye lens; choose box \
-    or contraction, or lens: undo";
-/// Reason for cameras whose directions differ too much for a common frustum.
+/// Reason against NDC for views without depths.
+const DEPTHS_MISSING: &str = "parameter space: ndc requires the depth range of each view, which \
+    the data set lacks; give near and far, or choose box";
+/// Reason against NDC for fisheye lenses.
+const FISHEYE_REFUSED: &str = "parameter space: ndc cannot contain the view of a fisheye lens; \
+    choose box or contraction, or lens: undo";
+/// Reason against NDC for cameras whose directions differ too much for a common frustum.
 const NOT_FORWARD: &str =
     "parameter space: ndc requires cameras that face one direction; choose box or contraction";
 
@@ -121,7 +122,7 @@ fn ndc_bounds(
     let mut all: Vec<CameraDepths> = Vec::with_capacity(training.len() + others.len());
     for (camera, depths) in training.iter().chain(others) {
         if camera.intrinsics.distortion.is_fisheye() {
-            return Err(IS_FISHEYE);
+            return Err(FISHEYE_REFUSED);
         }
         all.push((camera.clone(), depths.or(guessed)));
     }
@@ -163,7 +164,7 @@ fn frustum(views: &[CameraDepths]) -> Result<Frustum, &'static str> {
         far: 0.0,
     };
     for (camera, depths) in views {
-        let [nearest, farthest] = depths.ok_or(NO_DEPTHS)?;
+        let [nearest, farthest] = depths.ok_or(DEPTHS_MISSING)?;
         // Known depths are those of matched points, but surfaces may be nearer or much farther. The
         // factors are chosen by hand.
         for corner in extreme_points(camera, [0.9 * nearest, 2.0 * farthest]) {
@@ -566,7 +567,7 @@ mod tests {
         let single = [looking_at(DVec3::Y, DVec3::ZERO)];
         assert_eq!(
             scene_bounds(&sights(&single, None), &[], false, Some(SpaceKind::Ndc)),
-            Err(NO_DEPTHS)
+            Err(DEPTHS_MISSING)
         );
         assert_eq!(
             scene_bounds(&sights(&single, None), &[], false, None).map(|b| b.space),
@@ -598,7 +599,7 @@ mod tests {
             }
         }
         assert!(bounds.longest_side() < 24.0 && bounds.far < 11.1, "{bounds:?}");
-        assert_eq!(scene_bounds(&seen, &[], false, Some(SpaceKind::Ndc)), Err(IS_FISHEYE));
+        assert_eq!(scene_bounds(&seen, &[], false, Some(SpaceKind::Ndc)), Err(FISHEYE_REFUSED));
         let known = scene_bounds(&seen, &[], false, None).unwrap();
         assert_eq!(known.space, Space::Box);
         let unknown = scene_bounds(&sights(&row, None), &[], true, None).unwrap();
@@ -613,7 +614,7 @@ mod tests {
                 false,
                 Some(SpaceKind::Ndc)
             ),
-            Err(IS_FISHEYE)
+            Err(FISHEYE_REFUSED)
         );
         // A box around the region that the cameras face doesn't contain the cameras, however wide
         // their angle of view is.

@@ -55,7 +55,7 @@ pub(crate) fn thread_pool<'a>(
 ) -> anyhow::Result<ThreadPool> {
     let needs: Result<Vec<MemoryNeed>, Failure> =
         frames.map(|frame| MemoryNeed::of(frame, images)).collect();
-    // The first of several.
+    // `max_by_key` returns the last of equal needs; reversed, the first.
     let largest = needs?.into_iter().rev().max_by_key(|need| need.bytes);
     let mut count = context.threads;
     if let (Some(largest), Some(free)) = (largest, available_memory()?) {

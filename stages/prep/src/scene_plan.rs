@@ -130,7 +130,12 @@ pub(crate) fn check_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, F
 
 /// Describes space and background for the log.
 pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
-    let background = format!("{background:?}").to_lowercase();
+    let background = match background {
+        Background::White => "white",
+        Background::Black => "black",
+        Background::Alpha => "alpha",
+        Background::Opaque => "opaque",
+    };
     let side = format_length(bounds.longest_side(), 3);
     let space = match bounds.space {
         Space::Box => format!(

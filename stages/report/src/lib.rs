@@ -60,7 +60,7 @@ impl Stage for Report {
     const ACCEPTS_FAILURES: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        Input::run(
+        Input::of_sink(
             "in pipeline.yaml: a block of `eval`, and further blocks, each under a name of your \
             choice; nerf-sr passes a folder with their record, run.json",
         )

@@ -38,7 +38,7 @@ impl Stage for Table {
     const ACCEPTS_FAILURES: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        Input::run(
+        Input::of_sink(
             "in pipeline.yaml: a block that scores; nerf-sr passes a folder with its record, \
             run.json",
         )

@@ -56,7 +56,7 @@ impl Stage for Video {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        Input::run(
+        Input::of_sink(
             "in pipeline.yaml: a block that renders views; nerf-sr passes a folder with its \
             record, run.json",
         )
@@ -206,7 +206,9 @@ mod tests {
             node("cameras", serde_json::json!({})),
             node("views", serde_json::json!({"cameras": {"node": 0}})),
             node("views", serde_json::json!({})),
-            node("views", serde_json::json!({"reference-views": {"node": 2}, "views": {"node": 1}})),
+            node("views", serde_json::json!(
+                {"reference-views": {"node": 2}, "views": {"node": 1}}
+            )),
         ]}))
         .unwrap();
         let rates: Vec<_> = run.nodes.iter().map(|node| path_rate(&run, node).unwrap()).collect();

@@ -78,7 +78,7 @@ impl Stage for Viewer {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        Input::run(
+        Input::of_sink(
             "in pipeline.yaml: a block that trains a field; nerf-sr passes a folder with its \
             record, run.json",
         )

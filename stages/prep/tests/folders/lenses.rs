@@ -179,7 +179,7 @@ fn refused_cases() -> Vec<Case> {
             "a model of COLMAP that isn't read",
             |folder| write_model(folder, "1 FOV 16 16 20 20 8 8 0.9\n"),
             Expected::Refused(
-                "dataset: DIR/sparse/0/cameras.txt: line 1: omega of camera model FOV is not supported; \
+                "dataset: DIR/sparse/0/cameras.txt: line 1: camera model FOV is not supported; \
                 undistort with colmap image_undistorter",
             ),
         ),

@@ -95,7 +95,8 @@ fn place_cases() -> Vec<Case> {
                 write_binary_images(folder);
             },
             Expected::Refused(
-                "dataset: DIR/sparse/0/cameras.bin: file not found; copy all files of the model",
+                "dataset: DIR/sparse/0: neither cameras.bin nor cameras.txt found; copy all files \
+                of the model",
             ),
         ),
         case(

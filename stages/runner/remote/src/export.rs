@@ -68,8 +68,9 @@ pub(crate) fn export(
     let history = History::find(store, start, records_only)?;
     let run = protect(store, history.records.values(), stop)?;
     let written = history.write(store, destination, stop);
-    unprotect(store, run)?;
-    written
+    let ended = unprotect(store, run);
+    written?;
+    Ok(ended?)
 }
 
 /// Artifact with the records of its history and their stored objects.
@@ -306,7 +307,13 @@ impl Destination<'_> {
         } else {
             archive.persist_noclobber(self.file)
         };
-        renamed.map_err(|e| e.error).with_context(|| self.name())?;
+        if let Err(problem) = renamed {
+            if problem.error.kind() == io::ErrorKind::AlreadyExists {
+                // The error with the remedy.
+                self.check()?;
+            }
+            return Err(problem.error).with_context(|| self.name());
+        }
         sync_folder(self.folder()).with_context(|| self.name())
     }
 }

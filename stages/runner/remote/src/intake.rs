@@ -121,7 +121,11 @@ pub(crate) fn protect<'a>(
     let entered = enter(store, stop)?;
     let run = store.begin_run(&entered, std::env::args().collect())?;
     for record in records {
-        run.record_action(&entered, &record.stage, &record.key())?;
+        if let Err(error) = run.record_action(&entered, &record.stage, &record.key()) {
+            // The first error is reported, even if the clean-up fails.
+            unprotect(store, run).ok();
+            return Err(error.into());
+        }
     }
     Ok(run)
 }
@@ -157,7 +161,11 @@ pub(crate) fn parse_record(bytes: &[u8], key: &str, name: &str) -> Result<Record
 
 /// Reads a manifest, called `name` in messages, in a scratch folder. Fails if its identity differs,
 /// or if it contains paths that nerf-sr doesn't write.
-fn read_manifest(folder: &Path, identity: &str, name: &str) -> Result<Manifest, Failure> {
+pub(crate) fn read_manifest(
+    folder: &Path,
+    identity: &str,
+    name: &str,
+) -> Result<Manifest, Failure> {
     let problem = match Manifest::read(folder) {
         Err(Damage::Manifest { reason, .. }) => format!("not a manifest: {reason}"),
         Err(damage) => damage.to_string(),

@@ -3,14 +3,13 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use artifact::{
-    Failure, MANIFEST_FILE, Manifest, bail_bad_input, format_count, format_size, one_line,
-    print_line,
+    Failure, MANIFEST_FILE, bail_bad_input, format_count, format_size, one_line, print_line,
 };
 use store::{Record, Store, StoreError};
 
 use crate::export::{action_entry, object_entry};
 use crate::folder::{ACTIONS, Listing};
-use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, parse_record};
+use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, parse_record, read_manifest};
 use crate::remote::{Access, Remote};
 use crate::selection::Selection;
 use crate::transfer::{Progress, Transfer, run_all};
@@ -30,7 +29,8 @@ pub(crate) async fn pull(
         fetch_missing_records(store, remote, selection, &signals, &mut refused).await?;
     let intake = Arc::new(Intake::begin(store, stop)?);
     let objects = fetch_manifests(&intake, remote, missing, &signals, &mut refused).await?;
-    let total = objects.iter().fold(0, |sum: u64, object| sum.saturating_add(object.bytes()));
+    let sizes = objects.iter().filter_map(|object| object.bytes);
+    let total = sizes.fold(0, u64::saturating_add);
     drop(signals);
     let transfer = Transfer::new(remote, Progress::new("pull", total, stop));
     let tasks = objects
@@ -127,15 +127,9 @@ async fn fetch_record(
 struct Object {
     identity: String,
     records: Vec<Record>,
-    /// Manifest, which is also in the scratch folder; `None` if the store has the artifact.
-    manifest: Option<Manifest>,
-}
-
-impl Object {
-    /// Returns the size of the files to fetch.
-    fn bytes(&self) -> u64 {
-        self.manifest.as_ref().map_or(0, Manifest::size)
-    }
+    /// Size of the files to fetch, whose manifest is in the scratch folder; `None` if the store has
+    /// the artifact.
+    bytes: Option<u64>,
 }
 
 /// Fetches the manifests of the artifacts that the store lacks.
@@ -168,14 +162,14 @@ async fn fetch_manifest(
 ) -> anyhow::Result<Object> {
     progress.add(0)?;
     if intake.store.is_complete(&identity)? {
-        return Ok(Object { identity, records, manifest: None });
+        return Ok(Object { identity, records, bytes: None });
     }
     let file = object_entry(&identity, MANIFEST_FILE);
     let Some(bytes) = remote.read(&file, MAX_MANIFEST_BYTES).await? else {
         bail_bad_input!("{}: not found; push again from a complete store", remote.name(&file));
     };
     let manifest = intake.add_manifest(&identity, &bytes, &remote.name(&file))?;
-    Ok(Object { identity, records, manifest: Some(manifest) })
+    Ok(Object { identity, records, bytes: Some(manifest.size()) })
 }
 
 /// Fetches an artifact, checks it, and imports it with its records. Returns the number of new
@@ -185,10 +179,11 @@ async fn fetch_object(
     transfer: Arc<Transfer>,
     object: Object,
 ) -> anyhow::Result<(usize, u64)> {
-    let bytes = object.bytes();
-    let Object { identity, records, manifest } = object;
-    let Some(manifest) = manifest else { return Ok((intake.import(None, &records)?, 0)) };
+    let Object { identity, records, bytes } = object;
+    let Some(bytes) = bytes else { return Ok((intake.import(None, &records)?, 0)) };
     let folder = intake.scratch(&identity);
+    // Manifests of all artifacts at once may exceed the memory.
+    let manifest = read_manifest(&folder, &identity, &identity)?;
     run_all(manifest.files.into_iter().map(|entry| {
         let transfer = Arc::clone(&transfer);
         let source = object_entry(&identity, &entry.path);

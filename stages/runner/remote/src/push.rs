@@ -28,8 +28,9 @@ pub(crate) async fn push(
     let missing: Vec<&Record> = selected.difference(&existing).map(|key| &records[key]).collect();
     let run = protect(store, missing.iter().copied(), stop)?;
     let pushed = push_records(store, remote, &missing, stop).await;
-    unprotect(store, run)?;
+    let ended = unprotect(store, run);
     let (actions, bytes) = pushed?;
+    ended?;
     print_line!(
         "{}: {} pushed ({}), {} already present",
         remote.name(""),

@@ -75,8 +75,10 @@ impl Attempt {
     /// Replaces hard links by copies, since writing to a file by its other name would change the
     /// artifact. Fails if there is anything other than folders and regular files.
     fn copy_hard_links(&self) -> Result<(), StoreError> {
-        let files = list_output_files(&self.output)
-            .map_err(|problem| StoreError::NoArtifact(problem.to_string()))?;
+        let files = list_output_files(&self.output).map_err(|source| match source.kind() {
+            io::ErrorKind::InvalidData => StoreError::NoArtifact(source.to_string()),
+            _ => StoreError::Io { path: self.output.clone(), source },
+        })?;
         let copy = self.folder.join("copy");
         for (file, metadata) in files {
             if metadata.nlink() > 1 {
@@ -340,6 +342,11 @@ mod tests {
     fn an_attempt_without_an_artifact_fails() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
+        let unlisted = begin(&store, "k", None).copy_hard_links();
+        assert!(matches!(unlisted, Err(StoreError::Io { .. })), "{unlisted:?}");
+        let linked = begin(&store, "k", Some("1"));
+        std::os::unix::fs::symlink("gone", linked.output.join("link")).unwrap();
+        assert!(matches!(linked.copy_hard_links(), Err(StoreError::NoArtifact(_))));
         assert!(matches!(
             store.check(begin(&store, "k", None), "text"),
             Err(StoreError::NoArtifact(_))

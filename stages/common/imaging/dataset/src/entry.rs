@@ -13,20 +13,20 @@ impl Entry {
         Ok(Self(object.clone()))
     }
 
-    /// Returns the entry with values of `shared`, except lists, for keys that it lacks. An angle of
-    /// view takes the place of a shared focal length.
-    pub(crate) fn or(&self, shared: &Self) -> Self {
-        let mut merged = shared.0.clone();
-        merged.retain(|_, value| !value.is_array());
-        for (angle, length) in [("camera_angle_x", "fl_x"), ("camera_angle_y", "fl_y")] {
-            if self.has(angle) {
-                merged.remove(length);
-            }
-        }
-        for (key, value) in self.0.iter().filter(|(_, value)| !value.is_null()) {
-            merged.insert(key.clone(), value.clone());
-        }
-        Self(merged)
+    /// Returns the values of several keys, as an entry.
+    pub(crate) fn part(&self, keys: &[&str]) -> Self {
+        let values = keys.iter().filter_map(|key| Some(((*key).to_owned(), self.value(key)?)));
+        Self(values.map(|(key, value)| (key, value.clone())).collect())
+    }
+
+    /// Adds the values of `other`, in place of existing ones.
+    pub(crate) fn extend(&mut self, other: Self) {
+        self.0.extend(other.0);
+    }
+
+    /// Removes a key.
+    pub(crate) fn remove(&mut self, key: &str) {
+        self.0.remove(key);
     }
 
     /// Returns whether a key has a value.
@@ -82,7 +82,8 @@ impl Entry {
     }
 }
 
-fn expectation(expected: &str, found: &Value) -> String {
+/// Describes a value of the wrong type.
+pub(crate) fn expectation(expected: &str, found: &Value) -> String {
     format!("expected {expected}, found {}", shortened(&found.to_string()))
 }
 

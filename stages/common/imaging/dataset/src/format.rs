@@ -55,7 +55,12 @@ impl Format {
 /// Formats the name in artifacts.
 impl fmt::Display for Format {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&format!("{self:?}").to_lowercase())
+        f.write_str(match self {
+            Self::Blender => "blender",
+            Self::Transforms => "transforms",
+            Self::Llff => "llff",
+            Self::Colmap => "colmap",
+        })
     }
 }
 
@@ -63,4 +68,31 @@ impl fmt::Display for Format {
 pub(crate) fn expected_files() -> String {
     let [others @ .., last] = Format::ALL.map(Format::title);
     format!("{}, or {last}", others.join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    /// Returns the index of a format in [`Format::ALL`]. The match doesn't compile until a
+    /// new format has an index.
+    fn index_of(format: Format) -> usize {
+        match format {
+            Format::Blender => 0,
+            Format::Transforms => 1,
+            Format::Llff => 2,
+            Format::Colmap => 3,
+        }
+    }
+
+    #[test]
+    fn formats_differ_and_are_all_listed() {
+        assert_eq!(Format::ALL.map(index_of), [0, 1, 2, 3]);
+        let names: BTreeSet<String> = Format::ALL.iter().map(Format::to_string).collect();
+        assert_eq!(names.len(), Format::ALL.len());
+        let message = expected_files();
+        assert!(Format::ALL.iter().all(|format| message.contains(format.title())));
+    }
 }

@@ -11,6 +11,7 @@ use crate::entry::{Entry, quote_python_numbers};
 use crate::error::{frame_label, images_missing};
 use crate::file_status::path_text;
 use crate::frame::{Frame, assign_names};
+use crate::lens_entry::lens_part;
 use crate::lookup::{Lookup, LookupError};
 use crate::masks::{MaskFile, MaskKind};
 use crate::photograph::is_exr;
@@ -31,6 +32,8 @@ pub(crate) enum MissingImages {
 pub(crate) struct FrameFile {
     path: PathBuf,
     frames: Vec<FrameEntry>,
+    /// Lens of all frames, unless a frame has its own.
+    lens: Entry,
     /// nerfstudio's own split.
     pub(crate) split_lists: SplitLists,
 }
@@ -87,16 +90,17 @@ impl FrameFile {
         let mut file =
             value.and_then(|value| Entry::new(&value)).with_context(|| path_text(path))?;
         let values = file.take("frames").with_context(|| path_text(path))?;
+        let lens = lens_part(&file).with_context(|| path_text(path))?;
         let split_lists = SplitLists::read(&file).with_context(|| path_text(path))?;
         let mut frames = Vec::with_capacity(values.len());
         for (index, value) in values.iter().enumerate() {
-            let frame = Entry::new(value).and_then(|own| FrameEntry::new(own.or(&file)));
+            let frame = Entry::new(value).and_then(|entry| FrameEntry::new(&entry));
             frames.push(frame.with_context(|| {
                 let name = value.get("file_path").and_then(Value::as_str).unwrap_or("unnamed");
                 frame_label(path, index, name)
             })?);
         }
-        Ok(Self { path: path.to_path_buf(), frames, split_lists })
+        Ok(Self { path: path.to_path_buf(), frames, lens, split_lists })
     }
 
     /// Returns the path of the file.
@@ -126,7 +130,7 @@ impl FrameFile {
                 found => found.with_context(label)?,
             };
             let image = lookup.root().join(&file.path);
-            let mut frame = read_frame(image, entry).with_context(label)?;
+            let mut frame = read_frame(image, entry, &self.lens).with_context(label)?;
             frame.mask = find_mask(lookup, entry).with_context(label)?;
             frame.depth_file =
                 find_depth(lookup, entry, &mut read.unused_depths).with_context(label)?;

@@ -132,14 +132,24 @@ impl<'a> Bits<'a> {
             None => 1,
         };
         self.skip(length)?;
-        match ac {
-            Some(ac) => self.skip_band(Band { first: 1, ..band }, ac, &mut 0),
-            None => Some(()),
+        let Some(ac) = ac else { return Some(()) };
+        let mut coefficient = 1;
+        while coefficient <= band.last {
+            match self.run_and_length(ac)? {
+                // ZRL: sixteen zeros.
+                (15, 0) => coefficient += 16,
+                (_, 0) => break,
+                (zeros, length) => {
+                    self.skip(length)?;
+                    coefficient += zeros + 1;
+                }
+            }
         }
+        Some(())
     }
 
-    /// Skips the AC coefficients of a block, also of a progressive scan (G.1.2.2 and G.1.2.3).
-    /// `known` has the bits of non-zero coefficients; those of new ones are added.
+    /// Skips a block of a progressive scan without DC (G.1.2.2 and G.1.2.3). `known` has the bits
+    /// of non-zero coefficients; those of new ones are added.
     pub(crate) fn skip_band(&mut self, band: Band, table: &Table, known: &mut u64) -> Option<()> {
         let mut coefficient = band.first;
         while self.empty_blocks == 0 && coefficient <= band.last {

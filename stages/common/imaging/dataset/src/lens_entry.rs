@@ -14,6 +14,52 @@ const FISHEYE_MODELS: [&str; 5] =
 /// Names of panoramas in longitude and latitude.
 const PANORAMAS: [&str; 2] = ["equirectangular", "latlong"];
 
+/// Keys of a lens whose values are numbers.
+const NUMBERS: [&str; 16] = [
+    "camera_angle_x",
+    "camera_angle_y",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "w",
+    "h",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+    "p1",
+    "p2",
+];
+/// Other keys of a lens; the last four mark projections of instant-ngp that aren't supported.
+const OTHERS: [&str; 6] =
+    ["camera_model", "is_fisheye", "equirectangular", "latlong", "orthographic", "ftheta_p0"];
+
+/// Returns the values of a lens in an entry; fails if one has the wrong type.
+pub(crate) fn lens_part(entry: &Entry) -> anyhow::Result<Entry> {
+    for key in NUMBERS {
+        entry.number(key)?;
+    }
+    entry.text("camera_model")?;
+    entry.flag("is_fisheye")?;
+    Ok(entry.part(&[&NUMBERS[..], &OTHERS].concat()))
+}
+
+/// Returns a frame's lens: its own values, and those of the file's lens for the keys that it lacks.
+/// An own angle of view takes the place of a shared focal length.
+pub(crate) fn frame_lens(own: &Entry, shared: &Entry) -> Entry {
+    let mut lens = shared.clone();
+    for (angle, length) in [("camera_angle_x", "fl_x"), ("camera_angle_y", "fl_y")] {
+        if own.has(angle) {
+            lens.remove(length);
+        }
+    }
+    lens.extend(own.clone());
+    lens
+}
+
 /// Returns the distortion of a frame's lens, with instant-ngp's and nerfstudio's keys; fails for a
 /// model that isn't supported. For a fisheye lens k1 to k4 are OpenCV's. For a perspective lens k4
 /// is Brown's fourth radial term, as in nerfstudio, unless the model is OpenCV's rational one, the

@@ -2,10 +2,10 @@
 //! files, in the order of `Format::ALL`.
 //!
 //! A new format needs a module with its reader; in `format`, a variant of [`Format`], its place in
-//! `Format::ALL` and its description; in this file, the call of its reader, and its recognition
-//! unless a file identifies the format. Readers share the modules `frame`, `photograph`, `text` and
-//! `lookup`, which finds files. `masks` finds masks next to images; `nearby` and `conversion`
-//! explain why a folder is no data set.
+//! `Format::ALL`, its title, file and properties; in this file, the call of its reader, and its
+//! recognition unless a file identifies the format. Readers share the modules `frame`,
+//! `photograph`, `text` and `lookup`, which finds files. `masks` finds masks next to images;
+//! `nearby` and `conversion` explain why a folder is no data set.
 //!
 //! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left
 //! corner, scene units) with lens distortion; [`Frame::photograph`] reads the image, and turns it

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use anyhow::{Context as _, ensure};
 use artifact::{format_count, relative_path};
 
-use crate::entry::Entry;
+use crate::entry::{Entry, expectation};
 use crate::lookup::{Lookup, LookupError};
 
 /// Interval of held-out frames, as in LLFF's code.
@@ -35,7 +35,11 @@ impl Split {
 }
 
 /// nerfstudio's lists of file names. An empty list counts as absent.
-pub(crate) struct SplitLists([(&'static str, Vec<String>); 3]);
+pub(crate) struct SplitLists {
+    train: Vec<String>,
+    test: Vec<String>,
+    val: Vec<String>,
+}
 
 /// Frames by the names and files that split lists may contain.
 #[derive(Debug, Default)]
@@ -69,20 +73,16 @@ impl FrameNames {
 impl SplitLists {
     /// Reads the lists of training, test and validation views.
     pub(crate) fn read(entry: &Entry) -> anyhow::Result<Self> {
-        let mut lists =
-            ["train_filenames", "test_filenames", "val_filenames"].map(|key| (key, Vec::new()));
-        for (key, names) in &mut lists {
-            for name in entry.list(key)? {
-                let name = name.as_str().with_context(|| format!("{key}: {name} is not text"))?;
-                names.push(name.to_owned());
-            }
-        }
-        Ok(Self(lists))
+        Ok(Self {
+            train: read_names(entry, "train_filenames")?,
+            test: read_names(entry, "test_filenames")?,
+            val: read_names(entry, "val_filenames")?,
+        })
     }
 
     /// Returns the names in all lists.
     pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
-        self.0.iter().flat_map(|(_, names)| names).map(String::as_str)
+        [&self.train, &self.test, &self.val].into_iter().flatten().map(String::as_str)
     }
 
     /// Returns the split of `count` frames that the lists describe, with notes. Validation views
@@ -95,9 +95,9 @@ impl SplitLists {
         lookup: &mut Lookup,
     ) -> anyhow::Result<(Option<Split>, Vec<String>)> {
         let mut notes = Vec::new();
-        let [train, test, val] =
-            self.0.each_ref().map(|list| listed_frames(list, names, lookup, &mut notes));
-        let (train, test, val) = (train?, test?, val?);
+        let train = listed_frames("train_filenames", &self.train, names, lookup, &mut notes)?;
+        let test = listed_frames("test_filenames", &self.test, names, lookup, &mut notes)?;
+        let val = listed_frames("val_filenames", &self.val, names, lookup, &mut notes)?;
         let listed: BTreeSet<usize> = train.iter().chain(&test).chain(&val).copied().collect();
         let unlisted: BTreeSet<usize> = (0..count).filter(|i| !listed.contains(i)).collect();
         let mut split = [train, if test.is_empty() { val } else { test }];
@@ -125,10 +125,22 @@ impl SplitLists {
     }
 }
 
+/// Reads a list of names; empty if missing.
+fn read_names(entry: &Entry, list: &str) -> anyhow::Result<Vec<String>> {
+    let mut names = Vec::new();
+    for name in entry.list(list)? {
+        let text = name.as_str();
+        let text = text.with_context(|| format!("{list}: {}", expectation("text", name)))?;
+        names.push(text.to_owned());
+    }
+    Ok(names)
+}
+
 /// Returns the frames of a list. Names without a frame are noted; a list of only such names is an
 /// error.
 fn listed_frames(
-    (list, list_names): &(&str, Vec<String>),
+    list: &str,
+    list_names: &[String],
     names: &FrameNames,
     lookup: &mut Lookup,
     notes: &mut Vec<String>,

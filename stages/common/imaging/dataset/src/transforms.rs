@@ -1,3 +1,4 @@
+use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
@@ -11,26 +12,33 @@ use crate::file_status::path_text;
 use crate::format::Format;
 use crate::frame::{Frame, Turn};
 use crate::frame_file::{FrameFile, MissingImages, lookup_of};
-use crate::lens_entry::distortion;
+use crate::lens_entry::{distortion, frame_lens, lens_part};
 use crate::photograph::{ImageHeader, fit_camera, read_header};
 
-/// Frame of `transforms.json`, with the file's shared values.
+/// Frame of `transforms.json`.
 pub(crate) struct FrameEntry {
     pub(crate) file_path: String,
     pub(crate) mask_path: Option<String>,
     pub(crate) depth_file_path: Option<String>,
-    /// All values, of the pose and the lens, too.
-    values: Entry,
+    /// Pose, row by row.
+    transform_matrix: Value,
+    /// Lens, as far as it differs from the file's.
+    own_lens: Entry,
 }
 
 impl FrameEntry {
-    /// Reads the names of a frame's files.
-    pub(crate) fn new(values: Entry) -> anyhow::Result<Self> {
+    /// Reads a frame's values.
+    pub(crate) fn new(entry: &Entry) -> anyhow::Result<Self> {
         let [image, mask, depth] = ["file_path", "mask_path", "depth_file_path"]
-            .map(|key| values.text(key).map(|name| name.map(str::to_owned)));
-        let file_path = image?.context("missing field `file_path`")?;
-        ensure!(values.has("transform_matrix"), "missing field `transform_matrix`");
-        Ok(Self { file_path, mask_path: mask?, depth_file_path: depth?, values })
+            .map(|key| entry.text(key).map(|name| name.map(str::to_owned)));
+        let matrix = entry.value("transform_matrix");
+        Ok(Self {
+            file_path: image?.context("missing field `file_path`")?,
+            mask_path: mask?,
+            depth_file_path: depth?,
+            transform_matrix: matrix.context("missing field `transform_matrix`")?.clone(),
+            own_lens: lens_part(entry)?,
+        })
     }
 }
 
@@ -57,15 +65,19 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Dataset> {
     Ok(Dataset { format: Format::Transforms, frames: read.frames, split, notes })
 }
 
-/// Reads a frame without its name, mask and depth.
-pub(crate) fn read_frame(image: PathBuf, entry: &FrameEntry) -> anyhow::Result<Frame> {
-    let rows = entry.values.value("transform_matrix").and_then(matrix_rows);
+/// Reads a frame without its name, mask and depth; `lens` is the file's.
+pub(crate) fn read_frame(
+    image: PathBuf,
+    entry: &FrameEntry,
+    lens: &Entry,
+) -> anyhow::Result<Frame> {
+    let rows = matrix_rows(&entry.transform_matrix);
     let (camera_to_world, last) = match rows.as_deref() {
         Some([x, y, z]) => ([*x, *y, *z], None),
         Some([x, y, z, last]) => ([*x, *y, *z], Some(*last)),
         _ => bail!("transform_matrix must have 4 rows of 4 numbers"),
     };
-    let fitted = intrinsics(&entry.values, read_header(&image)?)?;
+    let fitted = intrinsics(&frame_lens(&entry.own_lens, lens), read_header(&image)?)?;
     let frame = Frame::new(image, fitted, camera_to_world);
     match frame.check() {
         Err(CameraError::Pose(problem)) => bail!("transform_matrix: {problem}"),
@@ -149,9 +161,10 @@ fn focal_length(
         return Ok(Some(length));
     }
     let Some(value) = entry.number(angle)? else { return Ok(None) };
+    let unit = if value > PI { " (is it in degrees?)" } else { "" };
     ensure!(
-        value > 0.0 && value < std::f64::consts::PI,
-        "{angle} is {}; the angle must be between 0 and π (is it in degrees?)",
+        value > 0.0 && value < PI,
+        "{angle} is {}; the angle must be between 0 and π{unit}",
         format_number(value)
     );
     Ok(Some(0.5 * f64::from(size) / (0.5 * value).tan()))
@@ -232,6 +245,15 @@ mod tests {
                 [0, 1].map(|i| &set.frames[i].lens_intrinsics).map(|k| [k.fx, k.fy]);
             assert_eq!(focal_lengths, [expected, [50.0, 52.0]], "{first}");
         }
+    }
+
+    /// Only the lens is shared, not the names of files, and `null` is no value.
+    #[test]
+    fn frames_share_the_lens_alone() {
+        let head = r#""fl_x": 50, "mask_path": "gone.png", "depth_file_path": "gone.exr""#;
+        let set = read(&frames(head, r#""fl_x": null,"#)).unwrap();
+        assert!(set.frames.iter().all(|f| f.mask.is_none() && f.depth_file.is_none()));
+        assert_eq!(set.frames[0].lens_intrinsics.fx, 50.0);
     }
 
     /// Intrinsics of the original image are scaled to its smaller copy.
@@ -337,7 +359,7 @@ mod tests {
             (r#""camera_angle_x": -1"#, "", "between 0 and π"),
             (r#""fl_x": 50"#, r#""k1": [1],"#, "k1: expected a number, found [1]"),
             (r#""fl_x": 50"#, r#""mask_path": 7,"#, "mask_path: expected text, found 7"),
-            (r#""fl_x": "wide""#, "", "fl_x: expected a number, found \"wide\""),
+            (r#""fl_x": 50"#, r#""fl_x": "wide","#, "fl_x: expected a number, found \"wide\""),
         ] {
             let message = read(&frames(head, first)).unwrap_err().to_string();
             assert!(
@@ -375,10 +397,25 @@ mod tests {
                 "frame 0 (unnamed): missing field `file_path`",
             ),
             (r#"{"frames": [1]}"#, "frame 0 (unnamed): expected a mapping, found 1"),
+            (
+                r#"{"fl_x": "wide", "frames": []}"#,
+                "transforms.json: fl_x: expected a number, found \"wide\"",
+            ),
+            (
+                r#"{"k1": [-0.3], "frames": [{}]}"#,
+                "transforms.json: k1: expected a number, found [-0.3]",
+            ),
+            (r#"{"test_filenames": [7], "frames": []}"#, "test_filenames: expected text, found 7"),
+            (
+                r#"{"file_path": "images/a.png", "frames": [{"transform_matrix": []}]}"#,
+                "frame 0 (unnamed): missing field `file_path`",
+            ),
         ] {
             let message = read(json).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");
         }
+        let message = read(&frames(r#""camera_angle_x": -1"#, "")).unwrap_err().to_string();
+        assert!(!message.contains("degrees"), "{message}");
         let missing = r#"{"fl_x": 50, "frames": [{"file_path": "x.png", "transform_matrix": []}]}"#;
         assert!(
             read(missing)

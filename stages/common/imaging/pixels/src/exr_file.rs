@@ -231,8 +231,7 @@ fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
 /// Reads the image's width and height, those of the display window, from the header; fails above
 /// [`MAX_PIXELS`](crate::MAX_PIXELS).
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
-    let [size, _] = read_windows(path)?;
-    Ok(size)
+    Ok(read_windows(path)?.size)
 }
 
 /// Returns the peak memory of [`read_exr`] in bytes, estimated from the header: each sample of the
@@ -246,10 +245,17 @@ pub fn exr_reading_bytes(path: &Path) -> Result<u64, PixelError> {
     Ok(4 * samples.sum::<u64>())
 }
 
-/// Reads the windows of the first layer from the header: width and height of the display window,
-/// and column and row of the data window's first pixel. Fails if the data window is not inside the
+/// Image's size, and the position of the first layer's data window in the image.
+struct Windows {
+    /// Width and height of the display window.
+    size: (usize, usize),
+    /// Column and row of the data window's first pixel.
+    start: (usize, usize),
+}
+
+/// Reads the windows of the first layer from the header. Fails if the data window is not inside the
 /// display window: pixels outside the image have no place in it.
-fn read_windows(path: &Path) -> Result<[(usize, usize); 2], PixelError> {
+fn read_windows(path: &Path) -> Result<Windows, PixelError> {
     let meta = read_header(path)?;
     let first = meta.headers.first().ok_or_else(|| PixelError::format(path, "no layer"))?;
     let (data, image) = (first.data_window(), first.shared_attributes.display_window);
@@ -266,7 +272,7 @@ fn read_windows(path: &Path) -> Result<[(usize, usize); 2], PixelError> {
         return Err(PixelError::format(path, format!("{}×{} pixels", size.0, size.1)));
     }
     if let (Some(left), Some(top)) = (left, top) {
-        return Ok([size, (left, top)]);
+        return Ok(Windows { size, start: (left, top) });
     }
     let [data, image] = [data, image].map(|window| {
         let (Vec2(width, height), Vec2(x, y)) = (window.size, window.position);
@@ -303,7 +309,7 @@ fn read_header(path: &Path) -> Result<MetaData, PixelError> {
 
 /// Reads every channel of the first layer as f32, padded with zeros to the display window.
 pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
-    let [(width, height), start] = read_windows(path)?;
+    let windows = read_windows(path)?;
     let image = exr::prelude::read()
         .no_deep_data()
         .largest_resolution_level()
@@ -322,19 +328,16 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
         .into_iter()
         .map(|c| {
             let samples = c.sample_data.values_as_f32().collect();
-            (c.name.to_string(), padded(samples, data_width, (width, height), start))
+            (c.name.to_string(), padded(samples, data_width, &windows))
         })
         .collect();
+    let (width, height) = windows.size;
     Ok(ExrImage { width, height, channels })
 }
 
 /// Pads the samples of a data window of the given width with zeros to the display window.
-fn padded(
-    samples: Vec<f32>,
-    data_width: usize,
-    (width, height): (usize, usize),
-    (left, top): (usize, usize),
-) -> Vec<f32> {
+fn padded(samples: Vec<f32>, data_width: usize, windows: &Windows) -> Vec<f32> {
+    let ((width, height), (left, top)) = (windows.size, windows.start);
     if samples.len() == width * height {
         return samples;
     }

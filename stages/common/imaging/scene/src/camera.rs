@@ -223,9 +223,15 @@ impl Camera {
         ] {
             // NaN is not allowed.
             if !allowed.contains(&(value / f64::from(side))) {
+                let is_focal_length = quantity == "focal length";
+                let bound = if is_focal_length && value <= 0.0 {
+                    "; focal lengths must be above 0"
+                } else {
+                    ""
+                };
                 return Err(CameraError::Intrinsics(format!(
                     "{name} is {} pixels, but the image's side is {side} pixels; check that the \
-                    {quantity} is in pixels and belongs to this image",
+                    {quantity} is in pixels and belongs to this image{bound}",
                     format_number(value)
                 )));
             }
@@ -360,17 +366,20 @@ mod tests {
         let mut bad = good.clone();
         bad.intrinsics.fx = 0.0;
         assert_refused(&bad, "fx is 0 pixels, but the image's side is 37 pixels");
+        assert_refused(&bad, "belongs to this image; focal lengths must be above 0");
         for (fx, cy, reason) in [
             (
                 1e300,
                 12.5,
-                "fx is 1e300 pixels, but the image's side is 37 pixels; check that the focal length",
+                "fx is 1e300 pixels, but the image's side is 37 pixels; check that the \
+                focal length",
             ),
             (1e-5, 12.5, "fx is 1e-5 pixels"),
             (
                 40.0,
                 -1e9,
-                "cy is -1e9 pixels, but the image's side is 23 pixels; check that the principal point",
+                "cy is -1e9 pixels, but the image's side is 23 pixels; check that the \
+                principal point",
             ),
             (40.0, f64::INFINITY, "cy is inf"),
         ] {

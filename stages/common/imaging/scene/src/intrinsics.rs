@@ -111,7 +111,11 @@ impl Intrinsics {
         // Bisection of the zoom, until it moves no corner by a hundredth of a pixel.
         while (high - low) * f64::from(self.width.max(self.height)) > 0.01 {
             let middle = 0.5 * (low + high);
-            *(if fits(middle) { &mut high } else { &mut low }) = middle;
+            if fits(middle) {
+                high = middle;
+            } else {
+                low = middle;
+            }
         }
         Some(self.zoomed_pinhole(high))
     }

@@ -60,7 +60,8 @@ mod radial {
 /// Lists the coefficients that aren't 0.
 impl fmt::Display for Distortion {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let names = ["k1", "k2", "k3", "k4", "p1", "p2", "d1", "d2", "d3"];
+        // The denominator has the names of OpenCV's rational model, which has no radial k4.
+        let names = ["k1", "k2", "k3", "k4", "p1", "p2", "k4", "k5", "k6"];
         let values = self.radial.iter().chain(&self.tangential).chain(&self.denominator);
         let terms = names.iter().zip(values).filter(|(_, value)| **value != 0.0);
         let terms = terms.map(|(name, value)| format!("{name} {}", format_number(*value)));

@@ -107,11 +107,12 @@ pub fn list_output_files(output: &Path) -> io::Result<Vec<(PathBuf, Metadata)>> 
             let metadata = entry.metadata()?;
             files.push((entry.into_path(), metadata));
         } else if !kind.is_dir() {
-            return Err(io::Error::other(format!(
+            let problem = format!(
                 "{} is {}; an output is a folder of folders and regular files only",
                 entry.path().display(),
                 file_kind(kind)
-            )));
+            );
+            return Err(io::Error::new(ErrorKind::InvalidData, problem));
         }
     }
     Ok(files)

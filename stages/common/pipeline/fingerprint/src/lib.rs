@@ -87,20 +87,24 @@ fn add_sources(hash: &mut Hash, root: &Path, crate_dir: &Path) -> Vec<PathBuf> {
     crates.into_values().map(|krate| krate.dir).collect()
 }
 
+fn is_rust(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "rs")
+}
+
 /// True for a module of unit tests in a file of its own: `tests.rs` or `NAME_tests.rs`.
 fn is_unit_test(path: &Path) -> bool {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    stem == "tests" || stem.ends_with("_tests")
+    is_rust(path) && (stem == "tests" || stem.ends_with("_tests"))
 }
 
 /// Returns the part of a file that the compiler turns into a program: the tokens of Rust code
 /// without comments and unit tests, or all bytes of another file.
 fn compiled_part(path: &Path, bytes: Vec<u8>) -> Vec<u8> {
-    if path.extension().is_none_or(|extension| extension != "rs") {
+    if !is_rust(path) {
         return bytes;
     }
     let text = String::from_utf8_lossy(&bytes);
-    // Rust code that isn't tokens doesn't compile, so the bytes of its key matter to nobody.
+    // Rust code that isn't tokens doesn't compile, so its key is never used.
     text.parse().map_or(bytes.clone(), |tokens| program_tokens(tokens).to_string().into_bytes())
 }
 
@@ -119,6 +123,7 @@ fn program_tokens(tokens: TokenStream) -> TokenStream {
         };
         let is_test = attribute == "cfg (test)" || attribute == "cfg(test)";
         if is_test || attribute.starts_with("doc =") {
+            // Removes `#` or `#!`.
             while kept.pop().is_some_and(|token| token.to_string() != "#") {}
         } else {
             let inner = program_tokens(group.stream());
@@ -261,7 +266,7 @@ mod tests {
 
     /// Workspace of four crates. `stage` depends on `shared`, on `extra` with a feature, and on the
     /// package `linux` on one system; `shared` depends on the package `used`. `other` is unused.
-    const FILES: [(&str, &str); 12] = [
+    const FILES: [(&str, &str); 13] = [
         (
             "Cargo.toml",
             "[workspace.dependencies]\nshared = {path = \"shared\"}\nextra = {path = \"extra\"}\n\
@@ -286,6 +291,7 @@ mod tests {
         ),
         ("stage/src/main.rs", "#![warn(missing_docs)]\n//! A stage.\nfn main() { work(1); }"),
         ("stage/src/unit_tests.rs", "const TESTED: u8 = 1;"),
+        ("stage/src/unit_tests.txt", "1"),
         ("stage/tests/it.rs", "const TESTED: u8 = 1;"),
         (
             "shared/Cargo.toml",
@@ -333,6 +339,7 @@ mod tests {
         for edit in [
             ("stage/src/main.rs", "1", "2"),
             ("stage/src/main.rs", "warn", "deny"),
+            ("stage/src/unit_tests.txt", "1", "2"),
             ("shared/src/lib.rs", "Debug", "Clone"),
             ("shared/src/lib.rs", "one: u8", "one: u16"),
             ("shared/src/lib.rs", "two: u8", "two: u16"),
@@ -361,6 +368,58 @@ mod tests {
             ("Cargo.lock", "checksum = \"cc\"", "checksum = \"cd\""),
         ] {
             assert_eq!(fingerprint(Some(edit)), unedited, "{edit:?}");
+        }
+    }
+
+    /// Returns whether each declaration of a module file in a source's text is under
+    /// `#[cfg(test)]`.
+    fn declarations(text: &str, file: &Path) -> Vec<bool> {
+        let [name, stem] =
+            [file.file_name(), file.file_stem()].map(|n| n.unwrap().to_str().unwrap());
+        let (module, path) = (format!("mod {stem};"), format!("#[path = \"{name}\"]"));
+        let lines: Vec<&str> = text.lines().map(str::trim).collect();
+        let mut found = Vec::new();
+        for (i, line) in lines.iter().enumerate().filter(|(_, line)| line.ends_with(';')) {
+            let above = lines[..i].iter().rev().take_while(|line| line.starts_with("#["));
+            let attributes: Vec<&str> = above.copied().collect();
+            let has_path = attributes.iter().any(|attribute| attribute.starts_with("#[path"));
+            let is_named = line.ends_with(&module) && !has_path;
+            if is_named || attributes.contains(&path.as_str()) {
+                found.push(attributes.contains(&"#[cfg(test)]"));
+            }
+        }
+        found
+    }
+
+    /// No file that fingerprints exclude is compiled into a program.
+    #[test]
+    fn files_of_unit_tests_are_modules_for_tests_only() {
+        let stages = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(3).unwrap();
+        let sources =
+            walkdir::WalkDir::new(stages).into_iter().map(|entry| entry.unwrap().into_path());
+        let is_source = |path: &PathBuf| path.iter().any(|part| part == "src");
+        let sources: Vec<PathBuf> =
+            sources.filter(|path| is_source(path) && is_rust(path)).collect();
+        let tests: Vec<&PathBuf> = sources.iter().filter(|path| is_unit_test(path)).collect();
+        assert!(tests.len() > 10, "{tests:?}");
+        for file in tests {
+            let folder = file.parent().unwrap();
+            let module = folder.with_extension("rs");
+            let mut found = Vec::new();
+            for path in &sources {
+                if path.parent() == Some(folder) || *path == module {
+                    found.extend(declarations(&fs::read_to_string(path).unwrap(), file));
+                }
+            }
+            assert!(!found.is_empty() && !found.contains(&false), "{}: {found:?}", file.display());
+        }
+        for (text, expected) in [
+            ("#[cfg(test)]\npub mod unit_tests;\nmod tests;", [true]),
+            ("#[cfg(test)]\n#[path = \"unit_tests.rs\"]\nmod tests;", [true]),
+            ("#[cfg(test)]\nmod tests;\nmod unit_tests;", [false]),
+            ("#[path = \"unit_tests.rs\"]\nmod more;", [false]),
+        ] {
+            assert_eq!(declarations(text, Path::new("unit_tests.rs")), expected, "{text}");
         }
     }
 

@@ -88,7 +88,17 @@ struct ProgressState {
     pace: Pace,
     /// Time of the latest report, or of creation.
     reported: Instant,
-    has_reported: bool,
+    /// Number of finished steps in the latest report, if any.
+    reported_done: Option<u64>,
+}
+
+impl ProgressState {
+    /// True if a report is due: the interval since the latest one has passed, or work that has been
+    /// reported has finished since.
+    fn is_due(&self, total: u64, interval: Duration) -> bool {
+        let has_grown = self.reported_done.is_some_and(|reported| self.done > reported);
+        self.reported.elapsed() >= interval || (self.done >= total && has_grown)
+    }
 }
 
 impl Progress {
@@ -109,7 +119,7 @@ impl Progress {
             seconds_left: None,
             pace: Pace::default(),
             reported: Instant::now(),
-            has_reported: false,
+            reported_done: None,
         };
         Self {
             label: label.to_owned(),
@@ -179,19 +189,18 @@ impl Progress {
         self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
-    /// Writes a report if the interval since the latest one has passed.
+    /// Writes a report if one is due.
     fn report(&self) {
         let mut state = self.lock();
         let done = state.done;
         state.pace.start(done);
         let interval =
             if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
-        let is_due = state.reported.elapsed() >= Duration::from_millis(interval)
-            || (done >= self.total && state.has_reported);
+        let is_due = state.is_due(self.total, Duration::from_millis(interval));
         if self.mode == ProgressMode::None || !is_due {
             return;
         }
-        (state.reported, state.has_reported) = (Instant::now(), true);
+        (state.reported, state.reported_done) = (Instant::now(), Some(done));
         let estimate = state.seconds_left;
         let left = state.pace.time_left(done, self.total, estimate);
         let [done_text, total_text] = [done, self.total]
@@ -318,6 +327,25 @@ fn format_seconds_left(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The end is reported once, also if further calls finish no step.
+    #[test]
+    fn the_end_is_reported_at_once_but_not_again() {
+        let mut state = ProgressState {
+            done: 10,
+            note: String::new(),
+            seconds_left: None,
+            pace: Pace::default(),
+            reported: Instant::now(),
+            reported_done: None,
+        };
+        let hour = Duration::from_secs(3600);
+        for (reported_done, expected) in [(None, false), (Some(9), true), (Some(10), false)] {
+            state.reported_done = reported_done;
+            assert_eq!(state.is_due(10, hour), expected, "{reported_done:?}");
+        }
+        assert!(!state.is_due(11, hour) && state.is_due(11, Duration::ZERO));
+    }
 
     #[test]
     fn time_left_depends_on_this_run_only() {

@@ -104,6 +104,7 @@ impl CameraModel {
                 "d1" => &mut denominator[0],
                 "d2" => &mut denominator[1],
                 "d3" => &mut denominator[2],
+                "omega" => bail!("camera model {name} is not supported; {UNDISTORT}"),
                 "sx1" | "sy1" if parameters[i] == 0.0 => continue,
                 _ => bail!("{parameter} of camera model {name} is not supported; {UNDISTORT}"),
             };

@@ -70,8 +70,8 @@ impl Model {
 
     pub(super) fn read_cameras(&mut self, folder: &Path) -> anyhow::Result<()> {
         let path = find_list(folder, "cameras")?.with_context(|| {
-            let path = path_text(&folder.join("cameras.bin"));
-            format!("{path}: file not found; copy all files of the model")
+            let problem = "neither cameras.bin nor cameras.txt found; copy all files of the model";
+            format!("{}: {problem}", path_text(folder))
         })?;
         self.read_list(&path, Self::read_binary_cameras, Self::read_text_cameras)
     }

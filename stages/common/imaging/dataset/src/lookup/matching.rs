@@ -17,16 +17,18 @@ pub(super) struct Tolerance {
 
 impl Tolerance {
     pub(super) const NONE: Self = Self { extension: false, form: false, case: false };
-
-    /// Returns all tolerances in the order of the attempts: `extension` varies fastest, then
-    /// `form`.
-    pub(super) fn all() -> [Self; 8] {
-        [0, 1, 2, 3, 4, 5, 6, 7].map(|bits| Self {
-            extension: bits & 1 > 0,
-            form: bits & 2 > 0,
-            case: bits & 4 > 0,
-        })
-    }
+    const EXTENSION: Self = Self { extension: true, ..Self::NONE };
+    /// All tolerances, in the order of the attempts.
+    pub(super) const STEPS: [Self; 8] = [
+        Self::NONE,
+        Self::EXTENSION,
+        Self { form: true, ..Self::NONE },
+        Self { form: true, ..Self::EXTENSION },
+        Self { case: true, ..Self::NONE },
+        Self { case: true, ..Self::EXTENSION },
+        Self { form: true, case: true, ..Self::NONE },
+        Self { form: true, case: true, ..Self::EXTENSION },
+    ];
 
     /// Returns a name without the differences in form and case that are tolerated.
     fn folded(self, name: &str) -> String {
@@ -35,19 +37,27 @@ impl Tolerance {
     }
 }
 
+/// Extensions that a file may have instead of the listed one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Extensions {
+    /// An image extension more, one of two less, or another instead of an unsupported format's.
+    Similar,
+    /// Any image extension: reduced copies often have another format.
+    Any,
+}
+
 /// File name to try for a listed name: the stem must match, the extension may be in any case.
 struct Variant {
     stem: String,
     extension: &'static str,
 }
 
-/// Returns the files that match a path, sorted. If `tolerance` includes the extension, a file may
-/// have any image extension or, without `any_extension`, a similar one.
+/// Returns the files that match a path, sorted.
 pub(super) fn candidates(
     listings: &mut Listings,
     path: &Path,
     tolerance: Tolerance,
-    any_extension: bool,
+    extensions: Extensions,
 ) -> Vec<PathBuf> {
     if tolerance == Tolerance::NONE {
         return if listings.is_file(path) { vec![path.to_path_buf()] } else { Vec::new() };
@@ -57,7 +67,7 @@ pub(super) fn candidates(
         return Vec::new();
     };
     let variants = if tolerance.extension {
-        variants(name, any_extension)
+        variants(name, extensions)
     } else {
         vec![Variant { stem: name.to_owned(), extension: "" }]
     };
@@ -103,12 +113,10 @@ fn with_each_extension(stem: &str) -> Vec<Variant> {
     IMAGE_EXTENSIONS.map(|extension| Variant { stem: stem.to_owned(), extension }).into()
 }
 
-/// Returns the names with any image extension or, without `any_extension`, with an image extension
-/// more, one of two less, or another instead of an unsupported format's.
-fn variants(name: &str, any_extension: bool) -> Vec<Variant> {
+fn variants(name: &str, extensions: Extensions) -> Vec<Variant> {
     let path = Path::new(name);
     let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or(name);
-    if any_extension && is_image_name(path) || is_unsupported_name(path) {
+    if extensions == Extensions::Any && is_image_name(path) || is_unsupported_name(path) {
         return with_each_extension(stem);
     }
     let mut found = with_each_extension(name);
@@ -147,9 +155,9 @@ fn is_drive(part: &str) -> bool {
 mod tests {
     use super::*;
 
-    fn variant_names(name: &str, any_extension: bool) -> Vec<String> {
+    fn variant_names(name: &str, extensions: Extensions) -> Vec<String> {
         let file_name = |v: Variant| format!("{}{}", v.stem, v.extension);
-        variants(name, any_extension).into_iter().map(file_name).collect()
+        variants(name, extensions).into_iter().map(file_name).collect()
     }
 
     #[test]
@@ -163,11 +171,11 @@ mod tests {
             ),
             ("a.HEIC", vec!["a.png", "a.jpg", "a.jpeg", "a.exr"]),
         ] {
-            assert_eq!(variant_names(name, false), expected);
+            assert_eq!(variant_names(name, Extensions::Similar), expected);
         }
         let any = ["a.png", "a.jpg", "a.jpeg", "a.exr"];
-        assert_eq!(variant_names("a.JPG", true), any);
-        assert_eq!(variant_names("a", true), any);
+        assert_eq!(variant_names("a.JPG", Extensions::Any), any);
+        assert_eq!(variant_names("a", Extensions::Any), any);
     }
 
     #[test]

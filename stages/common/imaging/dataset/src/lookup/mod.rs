@@ -22,7 +22,7 @@ use crate::photograph::is_image_name;
 use crate::unsupported::is_unsupported_name;
 
 pub(crate) use listings::Listings;
-use matching::{Tolerance, absolute_parts, candidates, inside_parts};
+use matching::{Extensions, Tolerance, absolute_parts, candidates, inside_parts};
 use steps::{Step, Steps};
 
 /// Folder of photographs in most formats; reduced copies are in `images_2`, `images_4` and so on.
@@ -70,6 +70,15 @@ impl From<PathBuf> for LocatedFile {
     }
 }
 
+/// Treatment of files that other names match literally.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum ClaimedFiles {
+    /// Claimed files are not found by tolerance.
+    Excluded,
+    /// Claimed files are also found by tolerance.
+    Included,
+}
+
 /// Function that splits names that may lose leading folders; `None` for other names.
 type SplitName = fn(&str) -> Option<Vec<&str>>;
 
@@ -81,9 +90,9 @@ struct Interpretation {
 }
 
 impl Interpretation {
-    /// True if the file may have any image extension: reduced copies often have another format.
-    fn has_any_extension(&self) -> bool {
-        self.steps.contains(&Step::Substitute)
+    fn extensions(&self) -> Extensions {
+        let is_copy = self.steps.contains(&Step::Substitute);
+        if is_copy { Extensions::Any } else { Extensions::Similar }
     }
 }
 
@@ -156,8 +165,10 @@ impl Lookup {
 
     /// Returns the folder that names are relative to.
     pub(crate) fn base(&self) -> PathBuf {
-        // Collecting removes the slash that `join` adds before an empty path.
-        self.root().join(&self.base).components().collect()
+        if self.base.as_os_str().is_empty() {
+            return self.root().to_path_buf();
+        }
+        self.root().join(&self.base)
     }
 
     /// Returns a path of the data set relative to the folder of photographs.
@@ -174,16 +185,15 @@ impl Lookup {
 
     /// Finds the file of a name, and records the steps that led there.
     pub(crate) fn find(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
-        self.locate(name, false)
+        self.locate(name, ClaimedFiles::Excluded)
     }
 
     /// Finds the file of a name in a list that repeats names, which another name may have claimed.
     pub(crate) fn find_repeated(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
-        self.locate(name, true)
+        self.locate(name, ClaimedFiles::Included)
     }
 
-    /// Finds the file of a name; one that another name matches literally only if `may_be_claimed`.
-    fn locate(&mut self, name: &str, may_be_claimed: bool) -> Result<LocatedFile, LookupError> {
+    fn locate(&mut self, name: &str, claimed: ClaimedFiles) -> Result<LocatedFile, LookupError> {
         let literal = self.literal_path(name);
         let mut missing = None;
         if let Ok(path) = &literal {
@@ -194,7 +204,7 @@ impl Lookup {
                 Err(problem) => return Err(problem.into()),
             }
         }
-        if let Some((file, steps)) = self.search(name, may_be_claimed)? {
+        if let Some((file, steps)) = self.search(name, claimed)? {
             self.steps.record(name, &file.path, steps);
             return Ok(file);
         }
@@ -236,12 +246,12 @@ impl Lookup {
     fn search(
         &mut self,
         name: &str,
-        may_be_claimed: bool,
+        claimed: ClaimedFiles,
     ) -> Result<Option<(LocatedFile, Vec<Step>)>, LookupError> {
         let interpretations = self.interpretations(name);
-        for tolerance in Tolerance::all() {
+        for tolerance in Tolerance::STEPS {
             for interpretation in &interpretations {
-                match &self.matches(interpretation, tolerance, may_be_claimed)[..] {
+                match &self.matches(interpretation, tolerance, claimed)[..] {
                     [] => {}
                     [file] => return Ok(Some(self.located(interpretation, tolerance, file))),
                     [first, second, ..] => {
@@ -284,17 +294,17 @@ impl Lookup {
         &mut self,
         interpretation: &Interpretation,
         tolerance: Tolerance,
-        may_be_claimed: bool,
+        claimed: ClaimedFiles,
     ) -> Vec<PathBuf> {
-        let (path, any_extension) = (&interpretation.path, interpretation.has_any_extension());
-        let mut files = candidates(&mut self.listings, path, tolerance, any_extension);
+        let (path, extensions) = (&interpretation.path, interpretation.extensions());
+        let mut files = candidates(&mut self.listings, path, tolerance, extensions);
         // A converted copy of an unsupported file is preferred to the file itself.
         if tolerance == Tolerance::NONE && !files.is_empty() && is_unsupported_name(path) {
             let converted = Tolerance { extension: true, ..tolerance };
-            let found = candidates(&mut self.listings, path, converted, any_extension);
+            let found = candidates(&mut self.listings, path, converted, extensions);
             files = if found.is_empty() { files } else { found };
         }
-        if tolerance != Tolerance::NONE && !may_be_claimed {
+        if tolerance != Tolerance::NONE && claimed == ClaimedFiles::Excluded {
             files.retain(|file| !self.claimed.contains(file));
         }
         files
@@ -316,7 +326,8 @@ impl Lookup {
             && file.extension().is_some_and(|extension| extension == "png");
         let is_exact = !tolerance.form && !tolerance.case;
         let is_renamed = tolerance.extension || is_exact && file != path;
-        let extension = is_renamed && !is_implied && !interpretation.has_any_extension();
+        let is_similar = interpretation.extensions() == Extensions::Similar;
+        let extension = is_renamed && !is_implied && is_similar;
         let is_doubled = extension && is_image_name(path) && is_image_name(&shorter);
         let label = if is_doubled { shorter } else { file.to_path_buf() };
         let mut steps = interpretation.steps.clone();
@@ -341,6 +352,10 @@ impl Lookup {
             None => vec![None],
         };
         let substitutes = self.substitutes();
+        if longest.is_none() && substitutes.len() == 1 {
+            // Nothing to choose.
+            return names.iter().any(|name| self.has_file(name));
+        }
         let mut best = (0, None, None);
         for removed in &removals {
             for substitute in &substitutes {
@@ -374,7 +389,7 @@ impl Lookup {
 
     /// True if at least one file matches a name.
     fn has_file(&mut self, name: &str) -> bool {
-        !matches!(self.search(name, true), Ok(None))
+        !matches!(self.search(name, ClaimedFiles::Included), Ok(None))
     }
 }
 

@@ -22,17 +22,25 @@ pub(super) enum Step {
     Case,
 }
 
-/// Steps that led from a data set's names to files, for the log. Each step has the names that it
-/// found, and the first name with its file.
+/// Names that one step of the lookup found.
+struct Found {
+    names: BTreeSet<String>,
+    /// First name with its file, as text.
+    first: String,
+}
+
+/// Steps that led from a data set's names to files, for the log.
 #[derive(Default)]
-pub(super) struct Steps(BTreeMap<Step, (BTreeSet<String>, String)>);
+pub(super) struct Steps(BTreeMap<Step, Found>);
 
 impl Steps {
     pub(super) fn record(&mut self, name: &str, file: &Path, steps: Vec<Step>) {
         for step in steps {
-            let (names, _) = (self.0.entry(step))
-                .or_insert_with(|| (BTreeSet::new(), format!("{name} is {}", path_text(file))));
-            names.insert(name.to_owned());
+            let found = self.0.entry(step).or_insert_with(|| Found {
+                names: BTreeSet::new(),
+                first: format!("{name} is {}", path_text(file)),
+            });
+            found.names.insert(name.to_owned());
         }
     }
 
@@ -40,7 +48,7 @@ impl Steps {
     /// removed from names, `substitute` the folder that is read instead of `images`.
     pub(super) fn notes(&self, removed: Option<usize>, substitute: Option<&str>) -> Vec<String> {
         let mut notes = Vec::new();
-        for (step, (names, first)) in &self.0 {
+        for (step, Found { names, first }) in &self.0 {
             let how = match (step, removed.unwrap_or(0)) {
                 (Step::Slashes, _) => "with slashes instead of backslashes".to_owned(),
                 (Step::Tail, 0) => "by reading absolute paths as relative ones".to_owned(),

@@ -156,3 +156,18 @@ proptest! {
         prop_assert!(error < 1e-10, "off by {error} radians");
     }
 }
+
+/// Coefficients have the names of the data sets' formats.
+#[test]
+fn coefficients_are_named_if_not_0() {
+    let rational = Distortion {
+        denominator: [0.25, 0.0, -0.5],
+        ..Distortion::brown([-0.1, 0.0, 0.0], [0.0, 0.01])
+    };
+    for (lens, expected) in [
+        (rational, "(k1 -0.1, p2 0.01, k4 0.25, k6 -0.5)"),
+        (Distortion::fisheye([0.0, 0.0, 0.0, 0.125]), "(fisheye, k4 0.125)"),
+    ] {
+        assert_eq!(lens.to_string(), expected);
+    }
+}

@@ -80,7 +80,7 @@ impl Input {
     }
 
     /// Returns the inputs of a sink: the record of a run, `run`.
-    pub fn run(summary: &str) -> Vec<(&'static str, Self)> {
+    pub fn of_sink(summary: &str) -> Vec<(&'static str, Self)> {
         vec![("run", Self::required(&["run"], summary))]
     }
 }

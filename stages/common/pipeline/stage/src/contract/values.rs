@@ -34,7 +34,7 @@ impl<'a> Reader<'a> {
                 if schemas.iter().any(|s| has_type(s, "integer"))
                     && !schemas.iter().any(|s| has_type(s, "string")) =>
             {
-                with_suffix(text).unwrap_or_else(|| value.clone())
+                with_suffix(text).map_or_else(|| value.clone(), Value::from)
             }
             Value::Array(items) => {
                 let items = items.iter().enumerate().map(|(index, item)| {
@@ -141,14 +141,22 @@ fn as_integer(number: &Number) -> Option<Value> {
 }
 
 /// Converts a number with the suffix k, M or G, such as `1.5M`; `None` if the result isn't whole.
-fn with_suffix(text: &str) -> Option<Value> {
-    let (digits, exponent) = [("k", "e3"), ("M", "e6"), ("G", "e9")]
+fn with_suffix(text: &str) -> Option<u64> {
+    let (digits, zeros) = [("k", 3), ("M", 6), ("G", 9)]
         .into_iter()
-        .find_map(|(suffix, exponent)| Some((text.strip_suffix(suffix)?, exponent)))?;
-    if digits.contains(|c: char| !c.is_ascii_digit() && c != '.') {
+        .find_map(|(suffix, zeros)| Some((text.strip_suffix(suffix)?, zeros)))?;
+    let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
+    let is_written = |part: &str| part.bytes().all(|digit| digit.is_ascii_digit());
+    // As JSON does, a number starts with a digit, and a dot is followed by one.
+    if whole.is_empty() || digits.ends_with('.') || !is_written(whole) || !is_written(fraction) {
         return None;
     }
-    as_integer(&serde_json::from_str(&format!("{digits}{exponent}")).ok()?)
+    let fraction = fraction.trim_end_matches('0');
+    if fraction.len() > zeros {
+        return None;
+    }
+    // Not by way of f64, which rounds above 2^53.
+    format!("{whole}{fraction:0<zeros$}").parse().ok()
 }
 
 #[cfg(test)]
@@ -166,10 +174,26 @@ mod tests {
             ("4.250k", json!(4250)),
             ("2G", json!(2_000_000_000)),
             ("0k", json!(0)),
+            ("9007199254740.993k", json!(9_007_199_254_740_993u64)),
+            ("18446744073709551.615k", json!(u64::MAX)),
+            ("1.0000000000000000000000000k", json!(1000)),
         ] {
             assert_eq!(Reader::new(&root).read(&integer, &json!(text)), expected);
         }
-        let invalid = ["M", ".5M", "5.M", "-5M", "1.23456k", "30m", "30 M", "1e3k", "99999999999G"];
+        let invalid = [
+            "M",
+            ".5M",
+            "5.M",
+            "-5M",
+            "1.2.3M",
+            "1.23456k",
+            "1.00000000000000000001k",
+            "30m",
+            "30 M",
+            "1e3k",
+            "18446744073709551.616k",
+            "99999999999G",
+        ];
         for text in invalid {
             assert_eq!(Reader::new(&root).read(&integer, &json!(text)), json!(text));
         }
