@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 
 use artifact::RunNode;
-use metrics::{ERROR_MAP_RANGE, ScoreFormat};
+use metrics::ERROR_MAP_RANGE;
 use radiance::{TRAINING_FILE, TrainingLog};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
