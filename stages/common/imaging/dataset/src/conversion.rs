@@ -2,7 +2,7 @@
 
 use std::fs::File;
 use std::io::Read as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use crate::file_status::{name_text, parent_folder, path_text, sub_folders, visible_entries};
 use crate::photograph::{has_extension, is_image_name};
