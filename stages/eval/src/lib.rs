@@ -122,7 +122,9 @@ impl Stage for Eval {
             figures: metrics.iter().flat_map(|metric| metric.figures()).collect(),
             picture_titles: metrics
                 .iter()
-                .filter_map(|metric| Some((metric.name(), metric.picture_title()?.to_owned())))
+                .filter_map(|metric| {
+                    Some((metric.name().to_owned(), metric.picture_title()?.to_owned()))
+                })
                 .collect(),
             mean: mean_of(scored.iter().map(|view| &view.scores)),
             least_gain: least_gain.flatten(),
@@ -162,7 +164,7 @@ fn score(
         if let Some(picture) = measured.picture {
             let file = format!("{}s/{name}.png", metric.name());
             write_png(&context.output_path(&file)?, &picture)?;
-            pictures.insert(metric.name(), file);
+            pictures.insert(metric.name().to_owned(), file);
         }
     }
     Ok(ViewScores { name: name.clone(), scores, error_map, pictures })
@@ -193,7 +195,7 @@ fn conventions(scene: &ScoredScene<'_>, metrics: &[Box<dyn Metric>]) -> BTreeMap
         ("error_maps".to_owned(), error_maps),
     ]);
     for metric in metrics {
-        conventions.insert(metric.name(), metric.convention(scene));
+        conventions.insert(metric.name().to_owned(), metric.convention(scene));
     }
     conventions
 }

@@ -8,12 +8,8 @@ use crate::scored_view::{ScoredScene, ScoredView};
 /// Metric that scores views. A new metric is a type that implements this trait, and a line in the
 /// list of `scoring/mod.rs`; `metrics.json`, the page and the summary follow from its methods.
 pub(crate) trait Metric: Sync {
-    /// Returns the key of the metric's convention, which is also the name of its pictures: the
-    /// first key in the paths of its figures.
-    fn name(&self) -> String {
-        let path = self.figures().swap_remove(0).path;
-        path.split('/').next().unwrap_or_default().to_owned()
-    }
+    /// Returns the key of the metric's convention, which is also the name of its pictures.
+    fn name(&self) -> &'static str;
     /// Returns the formats of the metric's scores, the most important first.
     fn figures(&self) -> Vec<ScoreFormat>;
     /// Describes the definition of the scores.

@@ -137,7 +137,7 @@ fn write_point(
     file.write_all(&colour.map(to_u8))
 }
 
-/// Writes little-endian floats.
+/// Writes a vector as three little-endian floats.
 pub(crate) fn write_vector(file: &mut impl Write, vector: Vec3) -> io::Result<()> {
     file.write_all(vector.to_array().map(f32::to_le_bytes).as_flattened())
 }

@@ -89,7 +89,7 @@ pub(crate) fn remove_misleading(
     ReferenceJudge {
         views: &views.views,
         warp_options,
-        read: &|view| Ok(job.read(view)?.0),
+        read: &|view| Ok(job.read(view)?.rendered),
         log: &|note| job.context.log_line(note),
     }
     .retain_reliable(references, confidence)

@@ -45,6 +45,16 @@ pub(crate) struct RefineJob<'a> {
     pub(crate) expects_consistent: bool,
 }
 
+/// View to refine.
+pub(crate) struct ViewToRefine {
+    /// Render in the form that the network takes.
+    pub(crate) rendered: Rendered,
+    /// All channels of the view's file.
+    file: ExrImage,
+    /// LR photograph of the same camera.
+    photograph: Option<Photograph>,
+}
+
 impl RefineJob<'_> {
     /// Refines one view and writes its files at the paths of image and preview in the output.
     pub(crate) fn refine(
@@ -53,7 +63,7 @@ impl RefineJob<'_> {
         references: &[KnownView],
         [image, preview]: [&str; 2],
     ) -> anyhow::Result<RefinedView> {
-        let (rendered, file, photograph) = self.read(view)?;
+        let ViewToRefine { rendered, file, photograph } = self.read(view)?;
         let mut statistics = vec![ReferenceStatistics::default(); references.len()];
         let mut refined =
             self.network.refine(&rendered, references, &self.application, &mut statistics)?;
@@ -67,12 +77,8 @@ impl RefineJob<'_> {
         Ok(RefinedView { is_consistent: photograph.is_some(), statistics })
     }
 
-    /// Reads a view in the form that the network takes, all channels of its file, and the LR
-    /// photograph of the same camera.
-    pub(crate) fn read(
-        &self,
-        view: &View,
-    ) -> Result<(Rendered, ExrImage, Option<Photograph>), Failure> {
+    /// Reads a view.
+    pub(crate) fn read(&self, view: &View) -> Result<ViewToRefine, Failure> {
         let needs_depth = self.network.takes_references();
         let (mut rendered, file) = read_view(self.views_input, view, self.background, needs_depth)?;
         let photographs = self.photographs.as_ref();
@@ -81,7 +87,7 @@ impl RefineJob<'_> {
             let colours = self.make_consistent(rendered.colours(), photograph.as_ref());
             rendered = rendered.with_colours(&colours);
         }
-        Ok((rendered, file, photograph))
+        Ok(ViewToRefine { rendered, file, photograph })
     }
 
     /// Makes an image of a view consistent with the view's LR photograph, if any.

@@ -202,8 +202,11 @@ fn numbers(mean: &Value) -> Vec<ScoreFormat> {
     let entries = mean.as_object().into_iter().flatten().filter(|(_, value)| value.is_number());
     entries
         .map(|(name, _)| ScoreFormat {
+            path: name.clone(),
+            label: name.clone(),
+            digits: 4,
             higher_is_better: None,
-            ..ScoreFormat::new(name, name, 4, true)
+            missing: None,
         })
         .collect()
 }

@@ -1,12 +1,11 @@
 use artifact::{bail_bad_input, bail_usage};
 use pixels::psnr_of;
 use refinement::{
-    Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer, TrainingOptions, WEIGHTS_FILE,
-    WarpOptions,
+    Refiner, RefinerArchitecture, RefinerTrainer, TrainingOptions, WEIGHTS_FILE, WarpOptions,
 };
 use stage::Context;
 
-use crate::examples::{lr_photographs, read_examples, split};
+use crate::examples::{leave_out, lr_photographs, read_examples};
 use crate::params::CompactParams;
 use crate::steps::{ExampleTraining, training_failure};
 use crate::write_refiner_file;
@@ -18,7 +17,8 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     }
     let photographs = lr_photographs(context)?;
     let (views, truth) = (context.input("views")?, context.input("truth")?);
-    let (examples, left_out) = split(read_examples(views, truth, photographs.as_ref())?);
+    let all = read_examples(views, truth, photographs.as_ref())?;
+    let (examples, left_out) = leave_out(all);
     if net.references_per_view > 0 && examples.len() < 2 {
         bail_bad_input!(
             "input views: references_per_view needs at least three views with an image in input \
@@ -45,8 +45,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         format!("PSNR of training patches {:.2} dB", psnr_of(loss))
     })?;
     let trainer = training.trainer;
-    let file = trainer.score(&left_out, &examples)?;
+    let file = trainer.score(&left_out, &examples, photographs.is_some())?;
     trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?).map_err(training_failure)?;
-    let file = RefinerFile { data_consistent: photographs.is_some(), ..file };
     write_refiner_file(context, "views left out of training", &file)
 }

@@ -6,9 +6,10 @@ use stage::Context;
 /// Interval of the views that are left out of training (design note 015).
 const HOLD_OUT_EVERY: usize = 8;
 
-/// Splits examples into those to train on and those to score the network on: the fifth of each
-/// eight, or the last of fewer than five. A single example is used for both.
-pub(crate) fn split<T: Clone>(all: Vec<T>) -> (Vec<T>, Vec<T>) {
+/// Leaves some examples out of training. Returns first the examples to train on, then those left
+/// out, to score the network on: the fifth of each eight, or the last of fewer than five. A single
+/// example is used for both.
+pub(crate) fn leave_out<T: Clone>(all: Vec<T>) -> (Vec<T>, Vec<T>) {
     if all.len() == 1 {
         return (all.clone(), all);
     }
@@ -169,18 +170,19 @@ mod tests {
     #[test]
     fn every_eighth_is_left_out_and_none_is_lost() {
         for count in 2..40usize {
-            let (training, left_out) = split((0..count).collect());
+            let (training, left_out) = leave_out((0..count).collect());
             let mut all = [training.clone(), left_out.clone()].concat();
             all.sort_unstable();
             assert_eq!(all, (0..count).collect::<Vec<_>>(), "{count}");
             assert!(!training.is_empty() && !left_out.is_empty(), "{count}");
             assert!(left_out.len() <= count.div_ceil(HOLD_OUT_EVERY), "{count}: {left_out:?}");
         }
-        assert_eq!(split((0..16).collect::<Vec<_>>()).1, [4, 12]);
+        let (_, left_out) = leave_out((0..16).collect::<Vec<_>>());
+        assert_eq!(left_out, [4, 12]);
     }
 
     #[test]
     fn a_single_example_is_trained_on_and_left_out() {
-        assert_eq!(split(vec![7]), (vec![7], vec![7]));
+        assert_eq!(leave_out(vec![7]), (vec![7], vec![7]));
     }
 }

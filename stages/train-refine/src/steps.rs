@@ -32,7 +32,7 @@ impl<T: refinement::Training> stage::Training for ExampleTraining<'_, T> {
 pub(crate) fn training_failure(error: RefinementError) -> anyhow::Error {
     match error {
         RefinementError::NotFinite { .. }
-        | RefinementError::Weights(WeightsError::NotFinite(..)) => {
+        | RefinementError::Weights(WeightsError::NotFinite { .. }) => {
             Failure::Numerical(error.to_string()).into()
         }
         error => error.into(),
@@ -48,7 +48,7 @@ mod tests {
     #[test]
     fn numbers_that_are_not_finite_are_a_numerical_failure() {
         let unusable = RefinementError::Unusable("view r_0: too small".to_owned());
-        let weights = WeightsError::NotFinite("w".into(), "a".to_owned());
+        let weights = WeightsError::NotFinite { path: "w".into(), name: "a".to_owned() };
         for (error, code) in [
             (RefinementError::NotFinite { step: 7 }, 4),
             (RefinementError::Weights(weights), 4),

@@ -28,8 +28,8 @@ use serde_json::json;
 use stage::{Context, Input, Output, Rule, Stage};
 
 pub use params::{
-    Combine, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField, SceneFacts,
-    Supervision,
+    Combine, Exposure, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
+    SceneFacts, Supervision,
 };
 use supervision::alpha_background_error;
 pub use supervision::{Supersampling, set_up_supervision};
@@ -109,7 +109,7 @@ impl Stage for TrainSs {
         let init = init.map(|input| InitField::read(input, &mut file, anchor)).transpose()?;
         views.bounds = file.bounds;
         if let (Some(init), None) = (&init, given_exposure) {
-            params.exposure = Some(init.has_exposures()?);
+            params.exposure = init.has_exposures()?.into();
         }
         let mut log = TrainingLog { resolved: params.record(), ..TrainingLog::default() };
         if context.from_checkpoint() {
@@ -157,7 +157,7 @@ impl Stage for TrainSs {
             rays += trained.rays;
             log.append(trained);
             // The measurement by the first member decides for all.
-            params.exposure = Some(!log.exposures.is_empty());
+            params.exposure = (!log.exposures.is_empty()).into();
             progress.set(rays, "");
         }
         log.resolved.extend(params.record());

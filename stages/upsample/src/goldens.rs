@@ -113,10 +113,10 @@ fn broken_weights_are_refused() {
 #[test]
 fn sizes_that_a_network_cannot_produce_are_refused() {
     assert!(
-        check_scale(Some(4), [[5, 7], [20, 28]]).is_ok()
-            && check_scale(None, [[5, 7], [13, 20]]).is_ok()
+        check_scale(Some(4), [5, 7], [20, 28]).is_ok()
+            && check_scale(None, [5, 7], [13, 20]).is_ok()
     );
-    assert!(check_scale(Some(4), [[5, 7], [20, 27]]).unwrap_err().to_string().contains("4 times"));
+    assert!(check_scale(Some(4), [5, 7], [20, 27]).unwrap_err().to_string().contains("4 times"));
 }
 
 /// IMDN with the released weights scores on ten real views as in PyTorch.

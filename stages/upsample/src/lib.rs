@@ -234,16 +234,16 @@ fn read_networks(
     let networks = networks.bad_input("input weights")?;
     let network_scale = networks.first().and_then(|n| n.as_ref()?.scale());
     for (view, camera) in pairs {
-        let sizes = [&view.camera, *camera]
+        let [lr, hr] = [&view.camera, *camera]
             .map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
-        check_scale(network_scale, sizes)
+        check_scale(network_scale, lr, hr)
             .map_err(|e| Failure::BadInput(format!("view {}: {file} {e}", camera.name)))?;
     }
     Ok(networks)
 }
 
 /// Fails if a network's scale, if it has one, doesn't map the LR size to the HR size.
-fn check_scale(scale: Option<i64>, [lr, hr]: [[i64; 2]; 2]) -> anyhow::Result<()> {
+fn check_scale(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> anyhow::Result<()> {
     let Some(scale) = scale.filter(|scale| lr.map(|size| size * scale) != hr) else {
         return Ok(());
     };

@@ -150,11 +150,11 @@ impl Baker<'_> {
                 let own = brick * VOXELS..(brick + 1) * VOXELS;
                 let visible: Vec<usize> = own.filter(|&v| shape.is_visible(v)).collect();
                 let shaded = self.shade_brick(bricks.positions[brick], &visible, &shape.seen)?;
-                let voxels = visible.into_iter().zip(shaded).map(|(voxel, (colour, view))| Voxel {
+                let voxels = visible.into_iter().zip(shaded).map(|(voxel, shaded)| Voxel {
                     position: bricks.voxel_position(voxel).map(|c| c as u16),
                     opacity: shape.opacity[voxel],
-                    colour,
-                    view,
+                    colour: shaded.colour,
+                    view: shaded.view,
                 });
                 Ok(voxels.collect())
             })
@@ -177,27 +177,26 @@ impl Baker<'_> {
             let position = positions[i * SAMPLES_PER_VOXEL + SAMPLES_PER_VOXEL / 2];
             directions.push(self.directions(position, seen[voxel]));
         }
-        let mut means = vec![([0.0; 3], [0.0; COEFFICIENTS]); voxels.len()];
+        let mut means = vec![Shaded { colour: [0.0; 3], view: [0.0; COEFFICIENTS] }; voxels.len()];
         let mut weights = vec![0.0f32; voxels.len()];
         for source in self.sources {
             let samples = source.samples(&positions)?;
             let shaded = shade(source.as_ref(), &samples, &directions, self.resolution)?;
             let voxels = shaded.into_iter().zip(voxels_of(&samples.densities)).enumerate();
-            for (i, ((colour, view), densities)) in voxels {
+            for (i, (shaded, densities)) in voxels {
                 let opacity = opacity_of(densities, self.resolution);
-                let (mean_colour, mean_view) = &mut means[i];
-                for (mean, value) in mean_colour.iter_mut().zip(colour) {
-                    *mean += opacity * value;
+                for c in 0..3 {
+                    means[i].colour[c] += opacity * shaded.colour[c];
                 }
-                for (mean, value) in mean_view.iter_mut().zip(view) {
-                    *mean += opacity * value;
+                for k in 0..COEFFICIENTS {
+                    means[i].view[k] += opacity * shaded.view[k];
                 }
                 weights[i] += opacity;
             }
         }
-        for ((colour, view), weight) in means.iter_mut().zip(weights) {
-            *colour = colour.map(|c| c / weight);
-            *view = view.map(|v| v / weight);
+        for (mean, weight) in means.iter_mut().zip(weights) {
+            mean.colour = mean.colour.map(|c| c / weight);
+            mean.view = mean.view.map(|v| v / weight);
         }
         Ok(means)
     }
@@ -217,7 +216,11 @@ impl Baker<'_> {
 }
 
 /// Colour and view dependence of a voxel, as in [`Voxel`].
-type Shaded = ([f32; 3], [f32; COEFFICIENTS]);
+#[derive(Clone)]
+struct Shaded {
+    colour: [f32; 3],
+    view: [f32; COEFFICIENTS],
+}
 
 /// Returns the positions at which a brick's voxels are sampled: voxel by voxel, x fastest.
 fn sample_positions(
@@ -322,7 +325,7 @@ fn shade(
                     |(raw, weight): (&[f32; 3], &f32)| weight / (1.0 + (-raw[c] - mean[c]).exp());
                 scale * samples.map(light).sum::<f32>()
             });
-            (colour, view)
+            Shaded { colour, view }
         })
         .collect())
 }

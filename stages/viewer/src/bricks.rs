@@ -4,6 +4,9 @@
 pub(crate) const BRICK_SIDE: usize = 8;
 /// Number of voxels in a brick.
 pub(crate) const VOXELS: usize = BRICK_SIDE * BRICK_SIDE * BRICK_SIDE;
+/// Index at a grid position without brick.
+const NO_BRICK: u32 = u32::MAX;
+
 /// Returns the position of an entry in a cubic grid of `side`³, x fastest.
 pub(crate) fn grid_position(index: usize, side: usize) -> [usize; 3] {
     [index % side, index / side % side, index / (side * side)]
@@ -13,9 +16,6 @@ pub(crate) fn grid_position(index: usize, side: usize) -> [usize; 3] {
 pub(crate) fn grid_index([x, y, z]: [usize; 3], side: usize) -> usize {
     x + side * (y + side * z)
 }
-
-/// Index at a grid position without brick.
-const NO_BRICK: u32 = u32::MAX;
 
 /// Existing bricks of a grid of `resolution`³ voxels. Voxel (x, y, z) has its centre at
 /// (x + 0.5, y + 0.5, z + 0.5) / resolution. Bricks are numbered in the order of their positions, x

@@ -65,6 +65,10 @@ fn masked_note(scene: &ScoredScene<'_>) -> &'static str {
 struct PsnrMetric;
 
 impl Metric for PsnrMetric {
+    fn name(&self) -> &'static str {
+        "psnr"
+    }
+
     fn figures(&self) -> Vec<ScoreFormat> {
         vec![ScoreFormat::new("psnr", "PSNR ↑ dB", 2, true)]
     }
@@ -92,6 +96,10 @@ impl Metric for PsnrMetric {
 struct SsimMetric;
 
 impl Metric for SsimMetric {
+    fn name(&self) -> &'static str {
+        "ssim"
+    }
+
     fn figures(&self) -> Vec<ScoreFormat> {
         vec![
             ScoreFormat::new("ssim", "SSIM ↑", 4, true),
@@ -123,6 +131,10 @@ impl Metric for SsimMetric {
 struct LowResolutionMetric;
 
 impl Metric for LowResolutionMetric {
+    fn name(&self) -> &'static str {
+        "low_resolution"
+    }
+
     fn figures(&self) -> Vec<ScoreFormat> {
         vec![
             ScoreFormat::new("low_resolution/psnr", "PSNR at LR ↑ dB", 2, true),
@@ -144,7 +156,7 @@ impl Metric for LowResolutionMetric {
             ("psnr", masked_psnr(&lr.render, &lr.truth, lr.counted_share)),
             ("ssim", ssim(&lr.render, &lr.truth).reflected),
         ]);
-        Ok(Measurement::one(&self.name(), score))
+        Ok(Measurement::one(self.name(), score))
     }
 
     fn summary(&self, mean: &Scores) -> Option<String> {
@@ -162,6 +174,10 @@ impl Metric for LowResolutionMetric {
 struct WarpMetric;
 
 impl Metric for WarpMetric {
+    fn name(&self) -> &'static str {
+        "warp"
+    }
+
     fn figures(&self) -> Vec<ScoreFormat> {
         vec![
             ScoreFormat::new("warp/psnr", "PSNR of warped neighbour ↑ dB", 2, true),
@@ -186,7 +202,7 @@ impl Metric for WarpMetric {
             return Ok(Measurement::default());
         };
         let score = Score::several([("psnr", score.psnr), ("seen", score.seen)]);
-        Ok(Measurement { picture: Some(picture), ..Measurement::one(&self.name(), score) })
+        Ok(Measurement { picture: Some(picture), ..Measurement::one(self.name(), score) })
     }
 }
 
@@ -194,6 +210,10 @@ impl Metric for WarpMetric {
 struct DepthMetric;
 
 impl Metric for DepthMetric {
+    fn name(&self) -> &'static str {
+        "depth"
+    }
+
     fn figures(&self) -> Vec<ScoreFormat> {
         vec![
             ScoreFormat::new("depth/mean_absolute", "depth error, mean of pixels ↓", 4, false),
@@ -232,7 +252,7 @@ impl Metric for DepthMetric {
             ("median_absolute", error.median_absolute),
             ("missed", error.missed),
         ]);
-        Ok(Measurement::one(&self.name(), score))
+        Ok(Measurement::one(self.name(), score))
     }
 
     fn summary(&self, mean: &Scores) -> Option<String> {

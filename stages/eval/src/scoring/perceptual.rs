@@ -139,6 +139,10 @@ pub(crate) fn weights_rule() -> Rule {
 const MISSING: &str = "weights not given";
 
 impl Metric for Perceptual {
+    fn name(&self) -> &'static str {
+        "lpips"
+    }
+
     fn figures(&self) -> Vec<ScoreFormat> {
         let mut figures = LpipsNetwork::ALL
             .map(LpipsNetwork::labels)

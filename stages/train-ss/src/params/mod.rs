@@ -9,7 +9,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use torch_field::MlpArchitecture;
 
-pub use resolved::{Resolved, ResolvedField};
+pub use resolved::{Exposure, Resolved, ResolvedField};
 pub use scene_facts::SceneFacts;
 
 /// Parameters of `train-ss`. [`Params::resolve`] replaces `None` with a default for the scene.

@@ -4,8 +4,8 @@ use torch_field::MlpArchitecture;
 use workload::RayBudget;
 
 use super::{
-    Combine, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField, SceneFacts,
-    Supervision,
+    Combine, Exposure, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
+    SceneFacts, Supervision,
 };
 use crate::supersample::whole_supersample;
 
@@ -54,13 +54,14 @@ impl Params {
             && scene.background != Background::Alpha
             && !scene.is_fine_tuning
             && !self.pose_refinement;
+        let exposure = if can_measure { Exposure::ByScene } else { Exposure::Off };
         let combine = if scene.is_ndc() { Combine::AverageWeights } else { Combine::Ensemble };
         Resolved {
             field: settings.field,
             supersample: self.supersample,
             supersample_warmup: settings.supersample_warmup,
             supervision: self.supervision.unwrap_or(supervision),
-            exposure: self.exposure.or((!can_measure).then_some(false)),
+            exposure: self.exposure.map_or(exposure, Exposure::from),
             pose_refinement: self.pose_refinement,
             silhouettes: self.silhouettes && is_grid,
             in_epochs: !is_grid,

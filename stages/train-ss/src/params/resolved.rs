@@ -28,9 +28,8 @@ pub struct Resolved {
     pub supersample_warmup: f64,
     /// Comparison of an LR pixel with its rays.
     pub supervision: Supervision,
-    /// True if exposures are estimated. With `None`, gains are measured in the first part of the
-    /// training, and estimated if they differ.
-    pub exposure: Option<bool>,
+    /// Estimation of exposures.
+    pub exposure: Exposure,
     /// True if camera poses are optimised.
     pub pose_refinement: bool,
     /// True if photographs with alpha limit the cells of the grid.
@@ -60,6 +59,23 @@ pub struct Resolved {
     pub seed: u64,
 }
 
+/// Estimation of exposures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Exposure {
+    /// Gains are 1.
+    Off,
+    /// Gains are estimated.
+    On,
+    /// Gains are measured in the first part of the training, and estimated if they differ.
+    ByScene,
+}
+
+impl From<bool> for Exposure {
+    fn from(is_estimated: bool) -> Self {
+        if is_estimated { Self::On } else { Self::Off }
+    }
+}
+
 /// Field with every default set.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ResolvedField {
@@ -87,7 +103,12 @@ impl Resolved {
     pub fn record(&self) -> BTreeMap<String, Value> {
         let common = json!({
             "combine": self.combine,
-            "exposure": self.exposure,
+            "exposure": match self.exposure {
+                Exposure::Off => Some(false),
+                Exposure::On => Some(true),
+                // Known after the first part of the training.
+                Exposure::ByScene => None,
+            },
             "learning_rate": self.learning_rate,
             "max_rays_per_step": self.max_rays_per_step,
             "rays": self.rays,

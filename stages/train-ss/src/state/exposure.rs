@@ -62,7 +62,7 @@ impl GainSums {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Exposures {
     sums: GainSums,
-    /// Gains, which follow from the sums.
+    /// Gains, which follow from the sums; empty in a state read from a checkpoint.
     #[serde(skip)]
     gains: Vec<[f32; 3]>,
 }

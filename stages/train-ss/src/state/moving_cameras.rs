@@ -24,9 +24,11 @@ const FIRST_HALVINGS: u32 = 3;
 /// Cameras that move during training so that the field's renders fit their photographs.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct MovingCameras {
+    /// Cameras at the start; empty in a state read from a checkpoint.
     #[serde(skip)]
     given: Vec<Camera>,
     current: Vec<Camera>,
+    /// Photographs of the cameras; empty in a state read from a checkpoint.
     #[serde(skip)]
     photographs: Vec<Pyramid>,
     /// Number of rounds done.

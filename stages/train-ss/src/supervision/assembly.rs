@@ -8,6 +8,7 @@ use scene::{Camera, Space};
 use super::options::SupersamplingOptions;
 use super::pixel_sampler::{Importance, PixelSampler, ViewPixels, detailed_pixels};
 use super::{Supersampling, TrainingView};
+use crate::params::Exposure;
 use crate::photographs::{PackedPhotograph, Photographs, PixelMemory, PixelSet};
 use crate::state::{
     ExposureMeasurement, Exposures, HrCache, KernelOperator, MovingCameras, SupervisionState,
@@ -54,10 +55,8 @@ impl Supersampling {
             },
             state: SupervisionState {
                 cache: assembly.cache,
-                exposures: (params.exposure == Some(true)).then(|| Exposures::new(view_count)),
-                measurement: params
-                    .exposure
-                    .is_none()
+                exposures: (params.exposure == Exposure::On).then(|| Exposures::new(view_count)),
+                measurement: (params.exposure == Exposure::ByScene)
                     .then(|| ExposureMeasurement::new(view_count, is_contraction)),
                 cameras,
             },

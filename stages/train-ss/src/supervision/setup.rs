@@ -9,7 +9,7 @@ use stage::available_memory;
 use super::Supersampling;
 use super::memory::{memory_text, pixel_memory, training_memory};
 use super::options::SupersamplingOptions;
-use crate::params::{Resolved, Supervision};
+use crate::params::{Exposure, Resolved, Supervision};
 use crate::photographs::{NO_SPACE, PackedPhotograph, Photographs, check_references};
 
 /// Returns the error message for a parameter that conflicts with background `alpha`.
@@ -92,7 +92,7 @@ fn kernel(scene: &GivenInput, params: &Resolved, background: Background) -> anyh
     let enabled = [
         ("supervision", needs_kernel),
         ("pose_refinement", params.pose_refinement),
-        ("exposure", params.exposure == Some(true)),
+        ("exposure", params.exposure == Exposure::On),
     ];
     if background == Background::Alpha
         && let Some((parameter, _)) = enabled.iter().find(|(_, is_enabled)| *is_enabled)

@@ -13,6 +13,10 @@ use crate::supervision::Supersampling;
 
 /// File name of a trainer's checkpoint.
 const CHECKPOINT: &str = "checkpoint.safetensors";
+/// Start of the file names of checkpoints' curves and states.
+const STATE_PREFIX: &str = "state-";
+/// Start of the file names of checkpoints' HR caches.
+const CACHE_PREFIX: &str = "cache-";
 
 /// Training curve of an unfinished training. Checkpoints contain all of it, so that a resumed
 /// training writes the same curve.
@@ -60,9 +64,17 @@ impl Curve {
     }
 }
 
+/// Content of `state-STEP.json`, written from references.
+#[derive(Serialize, Deserialize)]
+struct SavedState<C = Curve, S = SupervisionState> {
+    curve: C,
+    supervision: S,
+}
+
 /// Checkpoints in the work folder. A checkpoint has three files, written in this order:
-/// `curve-STEP.json`, the curve and the supervision's state; `kept-STEP.bin`, the HR cache;
-/// `checkpoint.safetensors`. The step in the last one decides which of the others belong to it.
+/// `state-STEP.json`, the curve and the supervision's state ([`SavedState`]); `cache-STEP.bin`, the
+/// HR cache; `checkpoint.safetensors`. The step in the last one decides which of the others belong
+/// to it.
 pub(crate) struct Checkpoints {
     folder: Option<PathBuf>,
     schedule: CheckpointSchedule,
@@ -89,23 +101,23 @@ impl Checkpoints {
         };
         let own = &supervision.state;
         let cache_bytes = own.cache.as_ref().map_or(0, HrCache::byte_length) as u64;
-        let complete = read_saved(&path, &mut *trainer).and_then(|(curve, state)| {
+        let complete = read_saved(&path, &mut *trainer).and_then(|saved| {
             let cache_path = path.with_file_name(cache_name(trainer.state().steps));
             let cache = File::open(&cache_path).ok()?;
             let is_complete = cache.metadata().ok()?.len() == cache_bytes
-                && state.view_counts() == own.view_counts();
-            is_complete.then_some((curve, state, cache, cache_path))
+                && saved.supervision.view_counts() == own.view_counts();
+            is_complete.then_some((saved, cache, cache_path))
         });
-        let Some((curve, state, mut cache, cache_path)) = complete else {
+        let Some((saved, mut cache, cache_path)) = complete else {
             log(format!("{}: incomplete checkpoint; starting over", path.display()));
             drop(trainer);
             return Ok((new_trainer()?, Curve::default()));
         };
-        supervision.restore(state, &mut cache).with_context(|| {
+        supervision.restore(saved.supervision, &mut cache).with_context(|| {
             format!("cannot read {}; delete it to start the training over", cache_path.display())
         })?;
         log(format!("resuming from step {}", trainer.state().steps));
-        Ok((trainer, curve))
+        Ok((trainer, saved.curve))
     }
 
     /// Writes a checkpoint if one is due or the run is interrupted, and there is a work folder.
@@ -134,8 +146,9 @@ fn write(
 ) -> anyhow::Result<()> {
     let partial = folder.join("checkpoint.partial");
     let step = trainer.state().steps;
-    let files = [curve_name(step), cache_name(step)];
-    artifact::write_json_atomically(&folder.join(&files[0]), &(curve, &supervision.state))?;
+    let files = [state_name(step), cache_name(step)];
+    let state = SavedState { curve, supervision: &supervision.state };
+    artifact::write_json_atomically(&folder.join(&files[0]), &state)?;
     let mut cache_file = File::create(&partial)?;
     if let Some(cache) = &supervision.state.cache {
         cache.write(&mut cache_file)?;
@@ -146,7 +159,8 @@ fn write(
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;
         let file = entry.file_name().to_string_lossy().into_owned();
-        if (file.starts_with("curve-") || file.starts_with("kept-")) && !files.contains(&file) {
+        let is_part = file.starts_with(STATE_PREFIX) || file.starts_with(CACHE_PREFIX);
+        if is_part && !files.contains(&file) {
             std::fs::remove_file(entry.path())?;
         }
     }
@@ -166,26 +180,25 @@ pub(crate) fn read_latest(work: &Path, trainer: &mut dyn FieldTrainer) -> Option
     let latest = files
         .filter(|entry| entry.file_name() == CHECKPOINT)
         .max_by_key(|entry| entry.metadata().ok().and_then(|metadata| metadata.modified().ok()))?;
-    read_saved(latest.path(), trainer).map(|(curve, _)| curve)
+    read_saved(latest.path(), trainer).map(|saved| saved.curve)
 }
 
-fn curve_name(step: u64) -> String {
-    format!("curve-{step}.json")
+/// Returns the file name of a step's [`SavedState`].
+fn state_name(step: u64) -> String {
+    format!("{STATE_PREFIX}{step}.json")
 }
 
+/// Returns the file name of a step's HR cache.
 fn cache_name(step: u64) -> String {
-    format!("kept-{step}.bin")
+    format!("{CACHE_PREFIX}{step}.bin")
 }
 
 /// Restores a trainer, and reads the checkpoint's curve and state; `None` if the checkpoint is
 /// incomplete, in which case the trainer may have been restored.
-fn read_saved(
-    checkpoint: &Path,
-    trainer: &mut dyn FieldTrainer,
-) -> Option<(Curve, SupervisionState)> {
+fn read_saved(checkpoint: &Path, trainer: &mut dyn FieldTrainer) -> Option<SavedState> {
     if !trainer.resume(checkpoint) {
         return None;
     }
-    let curve = checkpoint.with_file_name(curve_name(trainer.state().steps));
-    serde_json::from_slice(&std::fs::read(curve).ok()?).ok()
+    let state = checkpoint.with_file_name(state_name(trainer.state().steps));
+    serde_json::from_slice(&std::fs::read(state).ok()?).ok()
 }

@@ -18,7 +18,8 @@ pub(crate) trait FieldTrainer {
     fn state(&self) -> &TrainingState;
     /// Writes a checkpoint.
     fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()>;
-    /// Resumes from a checkpoint and returns whether that succeeded.
+    /// Resumes from a checkpoint and returns whether that succeeded. A trainer that failed may be
+    /// partly restored: create another one.
     fn resume(&mut self, path: &Path) -> bool;
     /// Ends the training and writes the field's weights, or their mean with those of a file `init`
     /// (design note 020).
@@ -77,6 +78,7 @@ pub(crate) fn new_trainer(
     }
 }
 
+/// Context of errors while trained weights are averaged with the initial ones.
 const CANNOT_AVERAGE: &str = "cannot average the weights";
 
 /// Implements the methods of [`FieldTrainer`] that all trainers have under the same names.

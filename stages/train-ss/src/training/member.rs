@@ -11,7 +11,7 @@ use stage::{Context, Progress};
 use super::checkpoint::{Checkpoints, Curve, read_latest};
 use super::field_trainer::{FieldTrainer, new_trainer};
 use super::time_left::{TimeLeft, TrainingRays};
-use crate::params::{Combine, Resolved};
+use crate::params::{Combine, Exposure, Resolved};
 use crate::supervision::{Supersampling, set_up_supervision};
 
 /// Inputs of a training run, and its progress bar.
@@ -127,7 +127,7 @@ impl<'a> Member<'a> {
     /// differences by floaters (design note 026).
     fn train(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         let with_exposures = self.with_exposures();
-        if self.params.exposure.is_none() && with_exposures.has_started() {
+        if self.params.exposure == Exposure::ByScene && with_exposures.has_started() {
             return with_exposures.run(data);
         }
         let mut training = self.start(data)?;
@@ -142,7 +142,7 @@ impl<'a> Member<'a> {
     /// marks the measurement as done.
     fn with_exposures(&self) -> Self {
         let mut member = self.clone();
-        member.params.exposure = Some(true);
+        member.params.exposure = Exposure::On;
         member.work = self.work.as_ref().map(|work| work.join("exposures"));
         member
     }

@@ -23,12 +23,16 @@ pub enum Family {
 static CHOSEN: AtomicU8 = AtomicU8::new(u8::MAX);
 
 impl Family {
+    const AVX512: u8 = Self::Avx512 as u8;
+    const AVX2: u8 = Self::Avx2 as u8;
+    const PORTABLE: u8 = Self::Portable as u8;
+
     /// Returns the family set with [`set_family`], by default the best that the machine supports.
     pub fn current() -> Self {
         match CHOSEN.load(Ordering::Relaxed) {
-            0 => Self::Avx512,
-            1 => Self::Avx2,
-            2 => Self::Portable,
+            Self::AVX512 => Self::Avx512,
+            Self::AVX2 => Self::Avx2,
+            Self::PORTABLE => Self::Portable,
             _ => {
                 let best = [Self::Avx512, Self::Avx2]
                     .into_iter()

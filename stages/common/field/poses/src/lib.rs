@@ -99,7 +99,7 @@ pub fn refine(
     let (mut best, mut equations, mut damping) = (camera.clone(), start, FIRST_DAMPING);
     for _ in 1..options.max_renders {
         let Some(motion) = equations.solve(damping) else { break };
-        let moved = moved(&best, motion);
+        let moved = apply_motion(&best, motion);
         let next = Equations::linearised(field, &moved, level, options)?;
         if next.error < equations.error {
             (best, equations, damping) = (moved, next, damping / 4.0);
@@ -192,14 +192,13 @@ impl Equations {
         }
     }
 
-    /// Returns the motion that minimises the error, for [`moved`]; `None` if too few pixels have a
-    /// depth.
-    fn solve(&self, damping: f64) -> Option<[DVec3; 2]> {
+    /// Returns the motion that minimises the error; `None` if too few pixels have a depth.
+    fn solve(&self, damping: f64) -> Option<Motion> {
         if self.pixels < MIN_PIXELS || !self.error.is_finite() {
             return None;
         }
         let [rotation, translation] = self.matrix.damped(damping).solve(self.right_sides)?;
-        Some([rotation, self.unit * translation])
+        Some(Motion { rotation, translation: self.unit * translation })
     }
 }
 
@@ -228,10 +227,19 @@ fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [[D
     [right, down].map(|along| [along.cross(point), -unit * along])
 }
 
-/// Moves a camera: `turn` is axis times angle in radians; both vectors are in the camera's axes.
-fn moved(camera: &Camera, [turn, translation]: [DVec3; 2]) -> Camera {
-    let rotated = rotation(camera) * DQuat::from_scaled_axis(turn);
-    with_pose(camera, rotated, camera.centre() + camera.rotation() * translation)
+/// Motion of a camera in its own axes.
+#[derive(Clone, Copy, Debug)]
+struct Motion {
+    /// Axis times angle, in radians.
+    rotation: DVec3,
+    /// Shift of the camera's centre, in scene units.
+    translation: DVec3,
+}
+
+/// Returns a camera after a motion.
+fn apply_motion(camera: &Camera, motion: Motion) -> Camera {
+    let rotated = rotation(camera) * DQuat::from_scaled_axis(motion.rotation);
+    with_pose(camera, rotated, camera.centre() + camera.rotation() * motion.translation)
 }
 
 fn rotation(camera: &Camera) -> DQuat {

@@ -98,8 +98,8 @@ fn pixels_apart(a: &Camera, b: &Camera) -> f64 {
         / positions.len() as f64
 }
 
-fn motion(turn: [f64; 3], shift: [f64; 3]) -> [DVec3; 2] {
-    [turn.into(), shift.into()]
+fn motion(turn: [f64; 3], shift: [f64; 3]) -> Motion {
+    Motion { rotation: turn.into(), translation: shift.into() }
 }
 
 #[test]
@@ -124,7 +124,7 @@ fn assert_image_motion(camera: &Camera) {
     for i in 0..6 {
         let component =
             |k: usize, size: f64| [0, 1, 2].map(|j| if j + k == i { size } else { 0.0 });
-        let moved = moved(camera, motion(component(0, step), component(3, unit * step)));
+        let moved = apply_motion(camera, motion(component(0, step), component(3, unit * step)));
         let (u, v, _) = moved.project(ray.at(distance)).unwrap();
         for (predicted, shift) in
             [(predicted[0][i / 3][i % 3], u - pixel[0]), (predicted[1][i / 3][i % 3], v - pixel[1])]
@@ -162,7 +162,7 @@ fn moved_cameras_are_restored() {
         let pyramid = Pyramid::new(&image, 5);
         // Half the size; a quarter would be too small.
         assert_eq!(pyramid.smaller_levels(), 1);
-        let mut found = moved(&truth, motion(turn, shift));
+        let mut found = apply_motion(&truth, motion(turn, shift));
         let before = pixels_apart(&truth, &found);
         assert!(before > 1.5, "{i}: {before} pixels");
         for level in (0..2).rev() {
@@ -214,7 +214,7 @@ impl RayField for Transformed {
 fn cameras_are_restored_in_any_position_and_unit() {
     let truth = camera(1);
     let pyramid = Pyramid::new(&photograph(&truth), 2);
-    let moved = moved(&truth, motion([0.01, -0.02, 0.01], [0.1, -0.05, 0.1]));
+    let moved = apply_motion(&truth, motion([0.01, -0.02, 0.01], [0.1, -0.05, 0.1]));
     let refined_with = |field: &dyn RayField, camera: &Camera| {
         let mut found = camera.clone();
         for level in (0..2).rev() {
@@ -271,7 +271,7 @@ fn uninformative_images_move_no_camera() {
 #[test]
 fn motions_are_reported() {
     let camera = camera(2);
-    let moved = moved(&camera, motion([0.0, 0.01, 0.0], [0.3, 0.0, -0.4]));
+    let moved = apply_motion(&camera, motion([0.0, 0.01, 0.0], [0.3, 0.0, -0.4]));
     let step = |to, depth| CameraMotion { from: &camera, to, depth };
     let mean = MeanMotion::of_cameras([step(&moved, Some(4.0)), step(&camera, None)].into_iter());
     assert!((mean.angle - 0.005).abs() < 1e-6 && (mean.distance - 0.25).abs() < 1e-9, "{mean:?}");
@@ -312,7 +312,7 @@ fn common_motion_is_removed() {
     }
     // The cameras' relative motion stays.
     let mut cameras = originals.clone();
-    cameras[2] = moved(&cameras[2], motion([0.02, 0.0, 0.01], [0.1, 0.0, 0.0]));
+    cameras[2] = apply_motion(&cameras[2], motion([0.02, 0.0, 0.01], [0.1, 0.0, 0.0]));
     let expected = relative_pose(&cameras);
     remove_common_motion(&mut cameras, &originals);
     let found = relative_pose(&cameras);
@@ -344,7 +344,7 @@ fn photometric_error_is_smallest_at_the_true_cameras() {
     assert!(right < 3e-4, "{right}");
     let moved: Vec<Camera> = (0..6)
         .map(|i| {
-            moved(
+            apply_motion(
                 &cameras[i],
                 motion([0.01 * (i as f64).sin(), 0.01 * (i as f64).cos(), 0.0], [0.0; 3]),
             )

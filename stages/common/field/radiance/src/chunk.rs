@@ -53,7 +53,7 @@ pub(crate) struct Chunk {
     pub(crate) sums: Vec<RaySum>,
     /// Samples marched in the last forward pass.
     pub(crate) samples: Samples,
-    /// Those of the samples that have a colour.
+    /// Samples with a colour in the last forward pass.
     pub(crate) counted: Counted,
     shading: Shading,
     backward: BackwardBuffers,

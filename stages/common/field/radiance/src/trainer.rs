@@ -143,7 +143,7 @@ impl Trainer {
         supervisor: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TrainingError> {
         let target_rays = self.options.rays_of_step(&self.state);
-        let step = Step::next(&self.state, supervisor, self.options.rays, target_rays);
+        let step = Step::start(&self.state, supervisor, self.options.rays, target_rays);
         let Some(step) = step else { return Ok(None) };
         self.phase(Phase::Occupancy, Self::update_occupancy);
         for layer in self.field.layers.all() {

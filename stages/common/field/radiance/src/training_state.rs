@@ -31,7 +31,7 @@ impl TrainingState {
         (self.rays as f64 / rays.max(1) as f64).min(1.0)
     }
 
-    /// Adds the bundles and rays of a step to the counters.
+    /// Adds a step's bundles and rays to the counters, and sets the mean number of samples per ray.
     pub fn count(&mut self, step: Step, samples: usize) {
         self.bundles += step.bundles as u64;
         self.rays += step.rays() as u64;
@@ -90,16 +90,16 @@ mod tests {
     #[test]
     fn a_step_has_the_target_or_the_remaining_rays() {
         let mut state = TrainingState::new(7.0);
-        let next = |state: &TrainingState, target| Step::next(state, &mut Nine, 100, target);
-        assert_eq!(next(&state, 40).unwrap().bundles, 4);
-        let small = next(&state, 4).unwrap();
+        let start = |state: &TrainingState, target| Step::start(state, &mut Nine, 100, target);
+        assert_eq!(start(&state, 40).unwrap().bundles, 4);
+        let small = start(&state, 4).unwrap();
         assert_eq!(small.bundles, 1);
         state.count(Step { bundles: 10, ..small }, 180);
         assert_eq!((state.progress(100), state.samples_per_ray), (0.9, 2.0));
-        let last = next(&state, 40).unwrap();
+        let last = start(&state, 40).unwrap();
         assert_eq!((last.first_bundle, last.first_ray, last.bundles), (10, 90, 1));
         state.count(last, 9);
-        assert!(next(&state, 40).is_none());
+        assert!(start(&state, 40).is_none());
     }
 
     #[test]

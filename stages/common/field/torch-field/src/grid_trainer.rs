@@ -89,7 +89,7 @@ impl GridTrainer {
         supervisor: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
         let target_rays = self.options.rays_of_step(&self.state);
-        let step = Step::next(&self.state, supervisor, self.options.rays, target_rays);
+        let step = Step::start(&self.state, supervisor, self.options.rays, target_rays);
         let Some(step) = step else { return Ok(None) };
         self.update_occupancy()?;
         let bundles = step.bundles;

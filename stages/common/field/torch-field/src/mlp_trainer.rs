@@ -126,7 +126,9 @@ impl MlpTrainer {
     /// Creates a trainer of `field`.
     pub fn new(field: Mlp, options: MlpTraining) -> Result<Self, TorchFieldError> {
         let adam = Adam::new(field.parameters())?;
-        Ok(Self { field, options, adam, state: TrainingState::new(0.0), stuck_steps: 0 })
+        // No estimate of the samples per ray: the number of rays of a step doesn't depend on it.
+        let state = TrainingState::new(0.0);
+        Ok(Self { field, options, adam, state, stuck_steps: 0 })
     }
 
     /// Returns the field in its current state.
@@ -146,7 +148,7 @@ impl MlpTrainer {
     ) -> Result<Option<StepReport>, TorchFieldError> {
         let MlpTraining { rays, max_rays_per_step, .. } = self.options;
         let done = self.state.progress(rays);
-        let step = Step::next(&self.state, supervisor, rays, max_rays_per_step);
+        let step = Step::start(&self.state, supervisor, rays, max_rays_per_step);
         let Some(step) = step else { return Ok(None) };
         let pieces = self.run_step(&*supervisor, step)?;
         let rays = step.rays();

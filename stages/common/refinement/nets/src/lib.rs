@@ -33,8 +33,13 @@ pub fn deterministic() {
 
 /// Error returned when `--device` names an unknown or unusable device.
 #[derive(Debug, thiserror::Error)]
-#[error("--device {0}: {1}")]
-pub struct DeviceError(String, String);
+#[error("--device {name}: {reason}")]
+pub struct DeviceError {
+    /// Name of the device.
+    name: String,
+    /// Reason why the device can't be used, with a remedy.
+    reason: String,
+}
 
 /// Returns the device that `--device` names: `cpu`, `cuda` or `cuda:N`.
 pub fn device(name: &str) -> Result<Device, DeviceError> {
@@ -44,7 +49,7 @@ pub fn device(name: &str) -> Result<Device, DeviceError> {
         Some(index) => index.strip_prefix(':').and_then(|i| i.parse::<usize>().ok()),
         None => None,
     };
-    usable_cuda_device(index).map_err(|reason| DeviceError(name.to_owned(), reason))
+    usable_cuda_device(index).map_err(|reason| DeviceError { name: name.to_owned(), reason })
 }
 
 /// Returns the GPU with this index, or the reason why it can't be used.

@@ -11,14 +11,29 @@ use crate::adam::all_finite;
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
     /// The file can't be opened or written.
-    #[error("{0}: {1}")]
-    Io(PathBuf, #[source] std::io::Error),
+    #[error("{path}: {source}")]
+    Io {
+        /// Path of the file.
+        path: PathBuf,
+        /// Cause.
+        source: std::io::Error,
+    },
     /// The file isn't safetensors, or its tensors aren't those of the network.
-    #[error("{0}: {1}; check that the weights are those of this network")]
-    Format(PathBuf, String),
-    /// A tensor to be written, by its name, isn't finite.
-    #[error("{0}: tensor {1} is not finite; lower the learning rate")]
-    NotFinite(PathBuf, String),
+    #[error("{path}: {reason}; check that the weights are those of this network")]
+    Format {
+        /// Path of the file.
+        path: PathBuf,
+        /// Reason, as a sentence fragment.
+        reason: String,
+    },
+    /// A tensor to be written isn't finite.
+    #[error("{path}: tensor {name} is not finite; lower the learning rate")]
+    NotFinite {
+        /// Path of the file.
+        path: PathBuf,
+        /// Name of the tensor.
+        name: String,
+    },
     /// A libtorch operation failed.
     #[error("libtorch: {0}")]
     Torch(#[from] TchError),
@@ -34,7 +49,8 @@ pub struct Weights {
 impl Weights {
     /// Reads a file of f32, f16, i64 or u8 tensors; f16 becomes f32.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
-        let bytes = std::fs::read(path).map_err(|e| WeightsError::Io(path.to_path_buf(), e))?;
+        let bytes = std::fs::read(path)
+            .map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })?;
         let file =
             SafeTensors::deserialize(&bytes).map_err(|e| format_error(path, e.to_string()))?;
         let mut tensors = BTreeMap::new();
@@ -107,7 +123,7 @@ impl Weights {
 }
 
 fn format_error(path: &Path, reason: String) -> WeightsError {
-    WeightsError::Format(path.to_path_buf(), reason)
+    WeightsError::Format { path: path.to_path_buf(), reason }
 }
 
 /// Writes named tensors of f32, i64 or u8 as safetensors without metadata, so that equal tensors
@@ -115,13 +131,14 @@ fn format_error(path: &Path, reason: String) -> WeightsError {
 pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
     for (name, tensor) in tensors {
         if !all_finite(std::slice::from_ref(tensor))? {
-            return Err(WeightsError::NotFinite(path.to_path_buf(), name.clone()));
+            let (path, name) = (path.to_path_buf(), name.clone());
+            return Err(WeightsError::NotFinite { path, name });
         }
     }
     let bytes = serialized(tensors)
         .map_err(std::io::Error::other)
         .and_then(|bytes| std::fs::write(path, bytes));
-    bytes.map_err(|e| WeightsError::Io(path.to_path_buf(), e))
+    bytes.map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })
 }
 
 /// Serialises named tensors as safetensors.

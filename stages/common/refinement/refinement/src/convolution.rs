@@ -468,9 +468,9 @@ struct Tiles {
 }
 
 impl Tiles {
-    /// Returns blocks of all tiles of some output maps.
+    /// Returns the tiles of some output maps in blocks of at most [`BLOCK`].
     #[inline(always)]
-    fn blocks_of(maps: &Maps) -> impl Iterator<Item = Self> + use<> {
+    fn blocks(maps: &Maps) -> impl Iterator<Item = Self> + use<> {
         let across = maps.width.div_ceil(TILE_OUTPUTS);
         let all = across * maps.height.div_ceil(TILE_OUTPUTS);
         (0..all).step_by(BLOCK).map(move |first| Self {
@@ -489,7 +489,7 @@ impl Tiles {
 }
 
 /// Calls a function for all `$rows` rows and all outputs of a product, in parts whose sums fit in
-/// registers.
+/// registers. `L` is the calling function's type of lanes.
 macro_rules! in_register_tiles {
     ($function:ident, $product:ident, $to:ident, $rows:expr) => {
         for row in (0..$rows).step_by(ROWS) {
@@ -521,17 +521,16 @@ fn multiply<L: Lanes>(tiles: Tiles, rows: &BlockRows, matrix: &[Vector], to: &mu
     }
 }
 
-/// Factors of a product at one point.
+/// Product of rows and a matrix.
 #[derive(Clone, Copy)]
 struct Product<'a> {
     /// A row of inputs for each tile.
     rows: &'a [Vector],
-    /// Number of vectors per row of inputs.
+    /// Number of vectors per row.
     inputs: usize,
-    /// Sixteen rows of `outputs` vectors for each vector of inputs; in an outer product a row of
-    /// gradients for each tile.
+    /// Sixteen rows of `outputs` vectors for each vector of inputs.
     matrix: &'a [Vector],
-    /// Number of vectors per row of `matrix`.
+    /// Number of vectors per row of the product.
     outputs: usize,
 }
 
@@ -586,22 +585,35 @@ fn add_outer_products<L: Lanes>(
     let size = inputs * LANES * outputs;
     for point in 0..POINTS {
         let rows = &rows.point(point)[..tiles.count * inputs];
-        let matrix = &gradients.point(point)[..tiles.count * outputs];
-        let product = Product { rows, inputs, matrix, outputs };
+        let gradients = &gradients.point(point)[..tiles.count * outputs];
+        let product = OuterProduct { rows, inputs, gradients, outputs };
         let to = &mut to[point * size..][..size];
         in_register_tiles!(add_outer_tile, product, to, inputs * LANES);
     }
 }
 
+/// Sum over tiles of the products of a tile's inputs and gradients.
+#[derive(Clone, Copy)]
+struct OuterProduct<'a> {
+    /// A row of inputs for each tile.
+    rows: &'a [Vector],
+    /// Number of vectors per row of inputs.
+    inputs: usize,
+    /// A row of gradients for each tile.
+    gradients: &'a [Vector],
+    /// Number of vectors per row of gradients.
+    outputs: usize,
+}
+
 /// Adds the products of `R` inputs and `V` vectors of outputs in registers.
 #[inline(always)]
 fn add_outer_tile<L: Lanes, const R: usize, const V: usize>(
-    product: Product<'_>,
+    product: OuterProduct<'_>,
     to: &mut [Vector],
     input: usize,
     output: usize,
 ) {
-    let Product { rows, inputs, matrix: gradients, outputs } = product;
+    let OuterProduct { rows, inputs, gradients, outputs } = product;
     let mut sums = [[L::splat(0.0); V]; R];
     for r in 0..R {
         for v in 0..V {
@@ -720,7 +732,7 @@ kernel! {
         let Scratch { inputs, products, .. } = scratch;
         inputs.resize(layer.input_vectors);
         products.resize(layer.output_vectors);
-        for tiles in Tiles::blocks_of(y) {
+        for tiles in Tiles::blocks(y) {
             transform_inputs::<L>(x, tiles, inputs);
             multiply::<L>(tiles, inputs, &layer.forward, products);
             transform_outputs::<L>(products, tiles, &layer.bias, after, y);
@@ -738,7 +750,7 @@ kernel! {
         products.resize(layer.input_vectors);
         transformed.resize(layer.output_vectors);
         let mut dx = dx;
-        for tiles in Tiles::blocks_of(dy) {
+        for tiles in Tiles::blocks(dy) {
             transform_inputs::<L>(x, tiles, inputs);
             transform_gradients::<L>(dy, gate, tiles, transformed, &mut gradients.bias);
             add_outer_products::<L>(tiles, inputs, transformed, &mut gradients.transformed);

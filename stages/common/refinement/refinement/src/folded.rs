@@ -75,30 +75,45 @@ fn clamped_index(start: isize, offset: usize, size: usize) -> usize {
 }
 
 /// One of eight orientations of a window: rotations by right angles and reflections.
-/// Bit 4 exchanges rows and columns; bits 1 and 2 mirror x and y.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Orientation(u8);
+pub(crate) struct Orientation {
+    /// True if rows and columns are exchanged.
+    swap: bool,
+    /// True if columns are mirrored.
+    flip_x: bool,
+    /// True if rows are mirrored.
+    flip_y: bool,
+}
 
 impl Orientation {
     /// All orientations; the first is the identity.
-    pub(crate) const ALL: [Self; 8] =
-        [Self(0), Self(1), Self(2), Self(3), Self(4), Self(5), Self(6), Self(7)];
+    pub(crate) const ALL: [Self; 8] = [
+        Self::new(0),
+        Self::new(1),
+        Self::new(2),
+        Self::new(3),
+        Self::new(4),
+        Self::new(5),
+        Self::new(6),
+        Self::new(7),
+    ];
 
-    fn has(self, bit: u8) -> bool {
-        self.0 & bit != 0
+    /// Returns the orientation of a number below 8, whose bits are its fields.
+    const fn new(number: u8) -> Self {
+        Self { swap: number & 4 != 0, flip_x: number & 1 != 0, flip_y: number & 2 != 0 }
     }
 
     /// Returns the window in this orientation: width and height are exchanged if necessary.
     pub(crate) fn oriented(self, window: Window) -> Window {
         let (width, height) = window.size;
-        Window { size: if self.has(4) { (height, width) } else { (width, height) }, ..window }
+        Window { size: if self.swap { (height, width) } else { (width, height) }, ..window }
     }
 
     /// Maps a column and row of the oriented window to those of the original window.
     pub(crate) fn source(self, window: Window, x: usize, y: usize) -> (usize, usize) {
-        let (x, y) = if self.has(4) { (y, x) } else { (x, y) };
+        let (x, y) = if self.swap { (y, x) } else { (x, y) };
         let (width, height) = window.size;
-        (if self.has(1) { width - 1 - x } else { x }, if self.has(2) { height - 1 - y } else { y })
+        (if self.flip_x { width - 1 - x } else { x }, if self.flip_y { height - 1 - y } else { y })
     }
 }
 

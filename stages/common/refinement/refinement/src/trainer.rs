@@ -127,10 +127,12 @@ impl RefinerTrainer {
 
     /// Describes the refiner with its scores for validation views, with references drawn from the
     /// training views, and with the residual weight that gives the smallest squared error.
+    /// `data_consistent` is true if the views are consistent with their own LR photographs.
     pub fn score(
         &self,
         examples: &[KnownView],
         references: &[KnownView],
+        data_consistent: bool,
     ) -> Result<RefinerFile, RefinementError> {
         let mut statistics = ReferenceStatistics::default();
         let mut views = Vec::with_capacity(examples.len());
@@ -168,7 +170,7 @@ impl RefinerTrainer {
             refined_psnr: refined / count,
             residual_weight,
             confidence: (statistics.visible_pixels > 0).then(|| statistics.confidence_share()),
-            data_consistent: false,
+            data_consistent,
         })
     }
 
@@ -211,9 +213,13 @@ impl RefinerTrainer {
     /// Returns the views that patches are drawn from: the pool, or all examples.
     fn views<'a>(&'a self, examples: &'a [KnownView]) -> Vec<TrainingView<'a>> {
         let Some(pool) = &self.pool else {
-            return examples.iter().map(|known| (&known.rendered.view, &known.truth)).collect();
+            return examples
+                .iter()
+                .map(|known| TrainingView { view: &known.rendered.view, truth: &known.truth })
+                .collect();
         };
-        pool.views.iter().map(|(i, view)| (view, &examples[*i].truth)).collect()
+        let views = pool.views.iter();
+        views.map(|(i, view)| TrainingView { view, truth: &examples[*i].truth }).collect()
     }
 }
 
@@ -327,8 +333,14 @@ fn merge_gradients(shards: &mut [Shard], architecture: RefinerArchitecture) -> V
     gradients.collect::<Vec<_>>().into_iter().flatten().collect()
 }
 
-/// Input view of the network, and its ground truth.
-type TrainingView<'a> = (&'a Image, &'a Image);
+/// View that patches are drawn from.
+#[derive(Clone, Copy)]
+struct TrainingView<'a> {
+    /// Input of the network.
+    view: &'a Image,
+    /// Ground truth.
+    truth: &'a Image,
+}
 
 /// Augmented patch of a view.
 struct TrainingPatch<'a> {
@@ -348,7 +360,7 @@ impl<'a> TrainingPatch<'a> {
         let mut rng = CounterRng::new(options.seed, PATCHES, number);
         let (mut view, mut square) = draw_square(views, options.patch_size, &mut rng);
         for _ in 0..MAX_REDRAWS {
-            if contrast(view.1, square) >= MIN_CONTRAST {
+            if contrast(view.truth, square) >= MIN_CONTRAST {
                 break;
             }
             (view, square) = draw_square(views, options.patch_size, &mut rng);
@@ -375,7 +387,7 @@ impl<'a> TrainingPatch<'a> {
         inputs: &mut Vec<f32>,
         residuals: &mut Vec<f32>,
     ) {
-        let (view, truth) = self.view;
+        let TrainingView { view, truth } = self.view;
         let around = self.square.grown(architecture.receptive_radius());
         around.fold(|x, y| {
             let (x, y) = self.orientation.source(around, x, y);
@@ -407,12 +419,12 @@ fn draw_square<'a>(
     side: usize,
     rng: &mut CounterRng,
 ) -> (TrainingView<'a>, Window) {
-    let view = views[rng.below(views.len() as u64) as usize];
+    let chosen = views[rng.below(views.len() as u64) as usize];
     // Starts at even pixels, aligned with the folds of whole views.
-    let [x, y] = [view.0.width, view.0.height].map(|size| {
+    let [x, y] = [chosen.view.width, chosen.view.height].map(|size| {
         (rng.below((size.saturating_sub(side) / FOLD + 1) as u64) as usize * FOLD) as isize
     });
-    (view, Window { x, y, size: (side, side) })
+    (chosen, Window { x, y, size: (side, side) })
 }
 
 /// Returns the range of the green channel in a square of the ground truth.
@@ -495,7 +507,7 @@ mod tests {
     fn a_blur_is_removed() {
         for guidance in [None, Some(WarpOptions::default())] {
             let (trainer, examples) = trained(guidance);
-            let scores = trainer.score(&[example(5)], &examples).unwrap();
+            let scores = trainer.score(&[example(5)], &examples, false).unwrap();
             assert!(scores.refined_psnr > scores.rendered_psnr + 6.0, "{scores:?}");
             assert!(scores.residual_weight > 0.8, "{scores:?}");
         }

@@ -19,10 +19,10 @@ pub struct Step {
 }
 
 impl Step {
-    /// Returns the step that follows those counted in `state`, after it has set the supervisor's
-    /// progress; `None` after the last step. `rays` is the number of rays of the training run,
-    /// `target_rays` that of the step.
-    pub fn next(
+    /// Sets the supervisor's progress and returns the step that follows those counted in `state`;
+    /// `None` after the last step. `rays` is the number of rays of the training run, `target_rays`
+    /// that of the step.
+    pub fn start(
         state: &TrainingState,
         supervisor: &mut impl Supervisor,
         rays: u64,

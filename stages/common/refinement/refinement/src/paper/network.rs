@@ -16,7 +16,8 @@ pub struct PaperRefiner {
 /// after the last layer of the decoder, otherwise ReLU.
 #[derive(Debug)]
 struct ConvLayer {
-    /// Tensors in the order of [`TENSORS`]; without batch normalisation only the first two.
+    /// Tensors in the order of [`TENSORS`]; without batch normalisation only the first
+    /// [`UNNORMALISED_TENSORS`]. Trainable ones require gradients.
     tensors: Vec<Tensor>,
     stride: i64,
 }
@@ -51,13 +52,22 @@ const DECODER: [LayerSpec; 12] = [
     (Some(1), Some(1), 1, true),
     (Some(1), None, 1, false),
 ];
-/// Names of a layer's tensors in a weights file: kernel, bias, and those of batch normalisation, of
-/// which the last two are running statistics.
-const TENSORS: [&str; 6] = ["weight", "bias", SCALE, "norm.bias", "norm.running_mean", VARIANCE];
+/// Name of a convolution's kernel in a weights file.
+const KERNEL: &str = "weight";
+/// Name of a convolution's bias.
+const BIAS: &str = "bias";
+/// Name of batch normalisation's factors.
 const SCALE: &str = "norm.weight";
+/// Name of batch normalisation's summands.
+const SHIFT: &str = "norm.bias";
+/// Name of batch normalisation's running means, which aren't trained.
+const MEAN: &str = "norm.running_mean";
+/// Name of batch normalisation's running variances, which aren't trained.
 const VARIANCE: &str = "norm.running_var";
-/// Number of a layer's tensors that are trainable, which come first.
-const TRAINABLE: usize = 4;
+/// Names of a layer's tensors, in the order of [`ConvLayer::tensors`].
+const TENSORS: [&str; 6] = [KERNEL, BIAS, SCALE, SHIFT, MEAN, VARIANCE];
+/// Number of tensors of a layer without batch normalisation: kernel and bias.
+const UNNORMALISED_TENSORS: usize = 2;
 /// Indices of the encoder layers whose features the decoder takes.
 const TAPS: [usize; 4] = [1, 3, 5, 6];
 /// Number of colour channels.
@@ -78,17 +88,19 @@ impl PaperRefiner {
     /// batch normalisation around 1). The published width is 128.
     pub fn new(width: u32, seed: u64) -> Result<Self, RefinementError> {
         let mut number = 0;
-        Self::build(width, |name, shape| {
+        Self::build(width, |_, shape, part| {
             number += 1;
             let mut rng = CounterRng::new(seed, WEIGHTS_STREAM, number);
             let count = shape.iter().product::<i64>();
             let inputs = shape[1..].iter().product::<i64>() as f64;
-            let values: Vec<f32> = if shape.len() > 1 {
-                (0..count).map(|_| ((2.0 / inputs).sqrt() * rng.normal()) as f32).collect()
-            } else if name.ends_with(SCALE) {
-                (0..count).map(|_| (1.0 + 0.02 * rng.normal()) as f32).collect()
-            } else {
-                vec![if name.ends_with(VARIANCE) { 1.0 } else { 0.0 }; count as usize]
+            let values: Vec<f32> = match part {
+                KERNEL => {
+                    (0..count).map(|_| ((2.0 / inputs).sqrt() * rng.normal()) as f32).collect()
+                }
+                SCALE => (0..count).map(|_| (1.0 + 0.02 * rng.normal()) as f32).collect(),
+                VARIANCE => vec![1.0; count as usize],
+                // Biases, summands and means.
+                _ => vec![0.0; count as usize],
             };
             Ok(Tensor::f_from_slice(&values)?.f_reshape(shape)?)
         })
@@ -102,7 +114,7 @@ impl PaperRefiner {
             return Err(RefinementError::Unusable(problem));
         }
         let weights = Weights::read(path)?;
-        Self::build(width, |name, shape| Ok(weights.tensor(name, shape)?))
+        Self::build(width, |name, shape, _| Ok(weights.tensor(name, shape)?))
     }
 
     /// Writes the weights.
@@ -115,10 +127,11 @@ impl PaperRefiner {
         self.parameters().map(|p| p.numel()).sum()
     }
 
-    /// Builds a network from tensors that `tensor` returns by name and shape.
+    /// Builds a network from tensors that `tensor` returns by full name, shape and name in
+    /// [`TENSORS`].
     fn build(
         width: u32,
-        mut tensor: impl FnMut(&str, &[i64]) -> Result<Tensor, RefinementError>,
+        mut tensor: impl FnMut(&str, &[i64], &str) -> Result<Tensor, RefinementError>,
     ) -> Result<Self, RefinementError> {
         let encoder = build_layers("encoder", &ENCODER, width, &mut tensor)?;
         let decoder = build_layers("decoder", &DECODER, width, &mut tensor)?;
@@ -142,6 +155,7 @@ impl PaperRefiner {
     pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
         let layers = self.encoder.iter().chain(&self.decoder);
         let tensors = layers.flat_map(|layer| &layer.tensors);
+        // `build_layers` has set this for trainable tensors only.
         tensors.filter(|tensor| tensor.requires_grad()).map(Tensor::shallow_clone)
     }
 
@@ -204,18 +218,22 @@ fn build_layers(
     name: &str,
     specs: &[LayerSpec],
     width: u32,
-    tensor: &mut impl FnMut(&str, &[i64]) -> Result<Tensor, RefinementError>,
+    tensor: &mut impl FnMut(&str, &[i64], &str) -> Result<Tensor, RefinementError>,
 ) -> Result<Vec<ConvLayer>, RefinementError> {
     let mut layers = Vec::with_capacity(specs.len());
     for (i, &(inputs, outputs, stride, normalised)) in specs.iter().enumerate() {
         let [inputs, outputs] = [inputs, outputs]
             .map(|multiple| multiple.map_or(COLOURS, |multiple| multiple * i64::from(width)));
-        let mut tensors = Vec::with_capacity(TENSORS.len());
-        for (k, part) in TENSORS.iter().take(if normalised { 6 } else { 2 }).enumerate() {
+        let parts = if normalised { &TENSORS[..] } else { &TENSORS[..UNNORMALISED_TENSORS] };
+        let mut tensors = Vec::with_capacity(parts.len());
+        for &part in parts {
+            let is_kernel = part == KERNEL;
             let kernel_shape = [outputs, inputs, 3, 3];
-            let shape = if k == 0 { &kernel_shape[..] } else { &[outputs] };
-            let tensor = tensor(&format!("{name}.{i}.{part}"), shape)?;
-            tensors.push(tensor.set_requires_grad(k < TRAINABLE));
+            // All other tensors have a value for each output.
+            let shape = if is_kernel { &kernel_shape[..] } else { &[outputs] };
+            let is_trainable = part != MEAN && part != VARIANCE;
+            let tensor = tensor(&format!("{name}.{i}.{part}"), shape, part)?;
+            tensors.push(tensor.set_requires_grad(is_trainable));
         }
         layers.push(ConvLayer { tensors, stride });
     }

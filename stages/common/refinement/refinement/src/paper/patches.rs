@@ -31,15 +31,9 @@ impl PaperRefiner {
         max_references: usize,
     ) -> Result<Image, RefinementError> {
         let view = &rendered.view;
-        let images = references.iter().map(|known| (&known.rendered, &known.truth));
-        for (rendered, image) in images.chain([(rendered, view)]) {
-            if image.width < PATCH_PIXELS || image.height < PATCH_PIXELS {
-                let reason = format!(
-                    "{}×{} pixels; the paper's network needs at least {PATCH_PIXELS}×{PATCH_PIXELS}",
-                    image.width, image.height
-                );
-                return Err(RefinementError::view(&rendered.camera.name, reason));
-            }
+        check_size(&rendered.camera.name, "the rendered view", view)?;
+        for known in references {
+            check_size(&known.rendered.camera.name, "the reference", &known.truth)?;
         }
         // Tensors aren't `Sync`, so each task takes handles of its own.
         let tasks: Vec<(Corner, Self)> = patch_starts(view.height)
@@ -78,6 +72,18 @@ impl PaperRefiner {
         let redrawn = redrawn.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
         Ok((corner, Vec::<f32>::try_from(&redrawn)?))
     }
+}
+
+/// Fails if an image of the view `name` is smaller than a patch; the message calls it `role`.
+fn check_size(name: &str, role: &str, image: &Image) -> Result<(), RefinementError> {
+    if image.width >= PATCH_PIXELS && image.height >= PATCH_PIXELS {
+        return Ok(());
+    }
+    let reason = format!(
+        "{role} has {}×{} pixels; the paper's network needs at least {PATCH_PIXELS}×{PATCH_PIXELS}",
+        image.width, image.height
+    );
+    Err(RefinementError::view(name, reason))
 }
 
 /// Returns the starts of patches along an axis; the last patch ends at the border.
@@ -258,8 +264,19 @@ mod tests {
             assert_eq!((refined.width, refined.height, refined.channels), (160, 96, 3));
             assert!(refined.data.iter().all(|v| (0.0..=1.0).contains(v)));
         }
+        // The view is checked first.
         let mut small = view.rendered.clone();
         small.view = image(63, 96, 4);
-        assert!(network.refine(&small, &[], 8).unwrap_err().to_string().contains("64×64"));
+        let mut small_reference = wall_view(20.0);
+        small_reference.truth = image(96, 60, 3);
+        let needed = "the paper's network needs at least 64×64";
+        assert_eq!(
+            network.refine(&small, &[&small_reference], 8).unwrap_err().to_string(),
+            format!("view 0: the rendered view has 63×96 pixels; {needed}")
+        );
+        assert_eq!(
+            network.refine(&view.rendered, &[&small_reference], 8).unwrap_err().to_string(),
+            format!("view 20: the reference has 96×60 pixels; {needed}")
+        );
     }
 }
