@@ -93,7 +93,9 @@ pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Opti
         _ => return None,
     };
     let start = if matches!(program, "prep" | "demo-scene") { 0.0 } else { START_SECONDS };
-    Some(ModelCost { processor_seconds: start + seconds, peak_memory })
+    let casts_rays = matches!(program, "demo-scene" | "train-ss" | "render-depth" | "export");
+    let is_opaque = casts_rays.then(|| work.kind.is_opaque());
+    Some(ModelCost { processor_seconds: start + seconds, peak_memory, is_opaque })
 }
 
 /// Returns the memory below which a stage fails. If memory is short, a training stores pixels in a

@@ -136,13 +136,7 @@ impl<'a> Estimator<'a> {
             State::WillRun { key_parts } => key_parts.clone(),
             _ => partial_key_parts(node),
         };
-        let similar = self.records.iter().filter(|record| {
-            let Some(other) = record.model else { return false };
-            let factor = other.processor_seconds / model.processor_seconds;
-            record.key_parts.get("stage").and_then(Value::as_str) == Some(program)
-                && record.processor_seconds.is_some_and(|seconds| seconds >= MIN_RECORD_SECONDS)
-                && (1.0 / MAX_TIME_FACTOR..MAX_TIME_FACTOR).contains(&factor)
-        });
+        let similar = self.records.iter().filter(|record| is_similar(record, program, model));
         nearest_record(&known_parts, similar)
     }
 
@@ -224,6 +218,17 @@ impl<'a> Estimator<'a> {
     }
 }
 
+/// True for a run of a program that has about the same size, and the same kind of scene: errors of
+/// the models for objects say nothing of opaque scenes.
+fn is_similar(record: &Record, program: &str, model: ModelCost) -> bool {
+    let Some(other) = record.model else { return false };
+    let factor = other.processor_seconds / model.processor_seconds;
+    record.key_parts.get("stage").and_then(Value::as_str) == Some(program)
+        && record.processor_seconds.is_some_and(|seconds| seconds >= MIN_RECORD_SECONDS)
+        && (1.0 / MAX_TIME_FACTOR..MAX_TIME_FACTOR).contains(&factor)
+        && other.is_opaque == model.is_opaque
+}
+
 /// Returns the parts of a node's key that are known while inputs are unknown: the program and the
 /// parameters.
 fn partial_key_parts(node: &Node) -> Map<String, Value> {
@@ -279,7 +284,7 @@ mod tests {
 
     #[test]
     fn an_earlier_run_corrects_the_model() {
-        let model = ModelCost { processor_seconds: 10.0, peak_memory: 1000 };
+        let model = ModelCost { processor_seconds: 10.0, peak_memory: 1000, is_opaque: None };
         let record = |seconds, memory| Record {
             processor_seconds: Some(seconds),
             peak_memory: Some(memory),
@@ -292,5 +297,25 @@ mod tests {
         let with_memory = |peak_memory| ModelCost { peak_memory, ..model };
         assert_eq!(corrections(&record(15.0, 500), with_memory(2000)), Some((1.5, 0.75)));
         assert_eq!(corrections(&record(15.0, 500), with_memory(600)), Some((1.5, 0.5)));
+    }
+
+    #[test]
+    fn runs_of_equal_programs_scenes_and_sizes_are_similar() {
+        let cost = |processor_seconds, is_opaque| ModelCost {
+            processor_seconds,
+            is_opaque: Some(is_opaque),
+            ..ModelCost::default()
+        };
+        let record = Record {
+            key_parts: [("stage".to_owned(), json!("render-depth"))].into_iter().collect(),
+            processor_seconds: Some(10.0),
+            model: Some(cost(20.0, false)),
+            ..Record::default()
+        };
+        let is_similar = |program, model| is_similar(&record, program, model);
+        assert!(is_similar("render-depth", cost(30.0, false)));
+        assert!(!is_similar("render-depth", cost(30.0, true)), "another kind of scene");
+        assert!(!is_similar("render-depth", cost(300.0, false)), "another size");
+        assert!(!is_similar("train-ss", cost(30.0, false)), "another program");
     }
 }
