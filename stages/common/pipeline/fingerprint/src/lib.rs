@@ -103,9 +103,11 @@ fn compiled_part(path: &Path, bytes: Vec<u8>) -> Vec<u8> {
     if !is_rust(path) {
         return bytes;
     }
-    let text = String::from_utf8_lossy(&bytes);
-    // Rust code that isn't tokens doesn't compile, so its key is never used.
-    text.parse().map_or(bytes.clone(), |tokens| program_tokens(tokens).to_string().into_bytes())
+    match String::from_utf8_lossy(&bytes).parse() {
+        Ok(tokens) => program_tokens(tokens).to_string().into_bytes(),
+        // Rust code that isn't tokens doesn't compile, so its key is never used.
+        Err(_) => bytes,
+    }
 }
 
 /// Returns tokens without doc comments and items for tests.
