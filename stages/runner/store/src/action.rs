@@ -62,8 +62,8 @@ pub struct ModelCost {
     pub processor_seconds: f64,
     /// Peak resident memory of the process in bytes.
     pub peak_memory: u64,
-    /// True if every ray of the scene hits a surface; missing for stages that cast no rays, and in
-    /// records of earlier versions.
+    /// True if the model took every ray of the scene to hit a surface; missing for stages that cast
+    /// no rays, and in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub is_opaque: Option<bool>,
 }
