@@ -7,7 +7,9 @@ use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use common::{Finished, Project, TINY, bin, signal, wait_until};
+use common::{Finished, Project, TINY, bin, signal, stage, wait_until};
+use pixels::{Rgba8, write_png};
+use serde_json::{Value, json};
 
 /// Copies a program by another process: a file that this process has open for writing can't be
 /// executed.
@@ -291,6 +293,44 @@ fn times_are_estimated_before_a_run() {
     let advice = project.ok(&["advise", "--memory", "20G"]);
     assert!(advice.trim_end().ends_with("-p quality=best --memory 20G"), "{advice}");
     assert!(project.ok(&["advise"]).trim_end().ends_with("-p quality=balanced"));
+}
+
+/// Before `prep` has run, estimates look at the borders of three photographs. After it, they and the
+/// run's records have the scene's own background, here of photographs that deceive.
+#[test]
+fn estimates_follow_the_photographs() {
+    let project = Project::tiny();
+    for (name, backdrop, kind) in [
+        ("white", false, "object in front of a plain background"),
+        ("yard", true, "opaque scene around the cameras"),
+    ] {
+        let parameters = json!({
+            "form": "transforms", "backdrop": backdrop, "size": 32, "train": 9, "test": 1,
+            "samples_per_axis": 1,
+        });
+        let made = stage("demo-scene", &parameters.to_string(), &[], &project.path(name), &[]);
+        assert_eq!(made.code, 0, "{}", made.stderr);
+        let advice = project.ok(&["advise", "-i", &format!("dataset={name}")]);
+        assert!(advice.contains(kind), "{name}: {advice}");
+    }
+    std::fs::remove_file(project.path("yard/artifact.json")).unwrap();
+    let transforms = std::fs::read(project.path("yard/transforms.json")).unwrap();
+    let transforms: Value = serde_json::from_slice(&transforms).unwrap();
+    let white = Rgba8::new(32, 32, vec![255; 4 * 32 * 32]);
+    for frame in [0, 3, 6] {
+        let photograph = transforms["frames"][frame]["file_path"].as_str().unwrap();
+        write_png(&project.path("yard").join(photograph), &white).unwrap();
+    }
+    let dataset = ["-i", "dataset=yard"];
+    let advice = project.ok(&[&["advise"], &dataset[..]].concat());
+    assert!(advice.contains("object in front of a plain background"), "{advice}");
+    project.ok(&[&["run", "train-ss", "-p", "lr_width=12"], &dataset[..]].concat());
+    let records = project.store_listing().into_iter().filter(|path| path.ends_with(".json"));
+    let records = records
+        .map(|path| -> Value { serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap() });
+    let trainings: Vec<Value> = records.filter(|record| record["stage"] == "train-ss").collect();
+    assert_eq!(trainings.len(), 1);
+    assert_eq!(trainings[0]["model"]["is_opaque"], true, "{}", trainings[0]);
 }
 
 /// Estimates for a camera path use the number and size of frames in its parameters or its file.

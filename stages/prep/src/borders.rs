@@ -3,18 +3,13 @@
 use std::fmt::{self, Display, Formatter};
 
 use artifact::{WARNING, format_count};
-use pixels::Rgba8;
+use dataset::{Border, plain_background};
+use pixels::{are_similar, medians};
 use scene::Background;
 
 use crate::inspection::ViewBorder;
-use crate::strips::{Strips, are_similar, colour, count_similar, medians};
+use crate::strips::Strips;
 
-/// Maximum deviation of a flat colour in 8-bit levels: JPEG noise on a uniform area. A clear sky
-/// varies more from corner to corner (docs/design/035).
-const MAX_BORDER_NOISE: u8 = 8;
-/// Minimum percentage of one colour in the borders of nine in ten views: an object that fills the
-/// image covers a fifth of the border, a bright sky about half (docs/design/035).
-const MIN_COLOUR_PERCENT: usize = 60;
 /// Minimum percentage of the colour in the borders of half of the views.
 const FLAT_PERCENT: usize = 90;
 
@@ -27,34 +22,6 @@ pub(crate) enum BorderEvidence {
     Flat([u8; 3]),
     /// Borders show more of the scene.
     Scene,
-}
-
-/// Content of one image's border.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Border {
-    /// The image has alpha.
-    Alpha,
-    /// At least [`MIN_COLOUR_PERCENT`] of the border's pixels are similar to their median.
-    Colour { median: [u8; 3], percent: usize },
-    /// Anything else.
-    Mixed,
-}
-
-impl Border {
-    /// Classifies an image's border.
-    pub(crate) fn of(image: &Rgba8) -> Self {
-        if image.data.chunks_exact(4).any(|p| p[3] != u8::MAX) {
-            return Self::Alpha;
-        }
-        let (width, height) = (image.width, image.height);
-        let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
-        let columns = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
-        let border: Vec<[u8; 3]> = rows.chain(columns).map(|(x, y)| colour(image, x, y)).collect();
-        let median = medians(&border);
-        let similar = count_similar(&border, median, MAX_BORDER_NOISE);
-        let percent = 100 * similar / border.len().max(1);
-        if percent >= MIN_COLOUR_PERCENT { Self::Colour { median, percent } } else { Self::Mixed }
-    }
 }
 
 /// Combined borders of the sampled views.
@@ -99,7 +66,7 @@ impl Borders {
         }
         let colours: Vec<[u8; 3]> = coloured.iter().map(|(colour, _)| *colour).collect();
         let common = medians(&colours);
-        coloured.retain(|(colour, _)| is_similar(*colour, common));
+        coloured.retain(|(colour, _)| are_similar(*colour, common, Border::MAX_NOISE));
         found.flat = coloured.iter().filter(|(_, percent)| *percent >= FLAT_PERCENT).count();
         if views > 0 && 10 * coloured.len() >= 9 * views && 2 * found.flat >= views {
             found.evidence = BorderEvidence::Flat(common);
@@ -181,18 +148,10 @@ impl Display for Borders {
     }
 }
 
-/// Returns the background of a colour that is white or black.
-fn plain_background(colour: [u8; 3]) -> Option<Background> {
-    let plain = [([u8::MAX; 3], Background::White), ([0; 3], Background::Black)];
-    plain.iter().find(|(level, _)| is_similar(colour, *level)).map(|(_, background)| *background)
-}
-
-fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
-    are_similar(colour, other, MAX_BORDER_NOISE)
-}
-
 #[cfg(test)]
 mod tests {
+    use pixels::Rgba8;
+
     use super::*;
 
     fn image_pixel(border: [u8; 3], noise: u8, touching: usize, index: usize) -> [u8; 4] {

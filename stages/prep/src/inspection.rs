@@ -1,10 +1,10 @@
 //! Samples training views: their borders and strips, and the spectrum of their images.
 
 use artifact::FailureExt as _;
-use dataset::Frame;
+use dataset::{Border, Frame};
 use rayon::prelude::*;
 
-use crate::borders::{Border, Borders};
+use crate::borders::Borders;
 use crate::detail::Spectrum;
 use crate::frame_label;
 use crate::strips::Strips;
@@ -50,11 +50,7 @@ impl Inspection {
 
 fn inspect_view(frame: &Frame) -> anyhow::Result<(ViewBorder, Spectrum)> {
     let image = frame.photograph().bad_input(frame_label(frame))?;
-    let mut border = Border::of(&image);
-    // Fisheye photographs are black outside their image circle, whatever the background.
-    if matches!(border, Border::Colour { .. }) && frame.intrinsics().has_clamped_rays() {
-        border = Border::Mixed;
-    }
+    let border = Border::of_frame(frame, &image);
     let strips = if border == Border::Alpha { None } else { Strips::of(&image) };
     let mut has_masked_strips = false;
     if let Some(strips) = &strips {

@@ -3,7 +3,7 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use pixels::{Mask, Rgba8};
+use pixels::{Mask, Rgba8, count_similar, medians};
 
 /// Maximum deviation of a strip's colour in 8-bit levels: JPEG rings next to the photograph.
 const MAX_STRIP_NOISE: u8 = 16;
@@ -101,15 +101,6 @@ impl Display for Strips {
     }
 }
 
-/// Returns the median of each component; zeros for an empty list.
-pub(crate) fn medians<T: Copy + Default + Ord, const N: usize>(items: &[[T; N]]) -> [T; N] {
-    std::array::from_fn(|component| {
-        let mut values: Vec<T> = items.iter().map(|item| item[component]).collect();
-        values.sort_unstable();
-        values.get(values.len() / 2).copied().unwrap_or_default()
-    })
-}
-
 /// Returns the number of lines parallel to a side.
 fn line_count(image: &Rgba8, side: usize) -> usize {
     if side.is_multiple_of(2) { image.height } else { image.width }
@@ -125,9 +116,9 @@ fn line(image: &Rgba8, side: usize, index: usize, ends: [usize; 2]) -> Vec<[u8; 
     let index = if side == 1 || side == 2 { count - 1 - index } else { index };
     let pixels = ends[0]..line_count(image, side + 1).saturating_sub(ends[1]);
     if side.is_multiple_of(2) {
-        pixels.map(|x| colour(image, x, index)).collect()
+        pixels.map(|x| image.colour(x, index)).collect()
     } else {
-        pixels.map(|y| colour(image, index, y)).collect()
+        pixels.map(|y| image.colour(index, y)).collect()
     }
 }
 
@@ -144,7 +135,7 @@ fn corners(image: &Rgba8, [top, right, bottom, left]: [usize; 4]) -> Vec<[u8; 3]
     let mut colours = Vec::new();
     for y in corner_indices(top, image.height - bottom) {
         for x in corner_indices(left, image.width - right) {
-            colours.push(colour(image, x, y));
+            colours.push(image.colour(x, y));
         }
     }
     colours
@@ -156,10 +147,6 @@ fn is_content(pixels: &[[u8; 3]], strip: [u8; 3]) -> bool {
     !pixels.is_empty() && 100 * similar <= MAX_INSIDE_PERCENT * pixels.len()
 }
 
-pub(crate) fn colour(image: &Rgba8, x: usize, y: usize) -> [u8; 3] {
-    std::array::from_fn(|c| image.data[4 * (y * image.width + x) + c])
-}
-
 /// Returns the median colour of a line if the line is flat.
 fn flat_colour(line: &[[u8; 3]]) -> Option<[u8; 3]> {
     let median = medians(line);
@@ -169,16 +156,6 @@ fn flat_colour(line: &[[u8; 3]]) -> Option<[u8; 3]> {
 fn is_flat(line: &[[u8; 3]], colour: [u8; 3]) -> bool {
     let similar = count_similar(line, colour, MAX_STRIP_NOISE);
     !line.is_empty() && 100 * similar >= MIN_FLAT_PERCENT * line.len()
-}
-
-/// Returns the number of pixels that are similar to a colour.
-pub(crate) fn count_similar(pixels: &[[u8; 3]], colour: [u8; 3], noise: u8) -> usize {
-    pixels.iter().filter(|pixel| are_similar(**pixel, colour, noise)).count()
-}
-
-/// True if no channel differs by more than `noise` 8-bit levels.
-pub(crate) fn are_similar(colour: [u8; 3], other: [u8; 3], noise: u8) -> bool {
-    (0..3).all(|c| colour[c].abs_diff(other[c]) <= noise)
 }
 
 #[cfg(test)]

@@ -10,6 +10,8 @@ use serde_json::{Map, Value};
 use slurm::Job;
 use store::{Record, Store, StoreError};
 
+use crate::estimates::Estimates;
+
 /// A plan with the states of its nodes.
 pub(crate) struct Planned<'a> {
     pub(crate) store: &'a Store,
@@ -18,6 +20,11 @@ pub(crate) struct Planned<'a> {
 }
 
 impl Planned<'_> {
+    /// Estimates the nodes that aren't cached.
+    pub(crate) fn estimates(&self) -> Estimates {
+        Estimates::new(&self.plan, &self.states, self.store)
+    }
+
     /// Finds the nodes that will run and on which a waiting node depends, directly or not.
     pub(crate) fn blocking_nodes(&self, index: usize) -> BTreeSet<usize> {
         let mut found = BTreeSet::new();

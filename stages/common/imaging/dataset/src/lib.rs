@@ -5,7 +5,8 @@
 //! `Format::ALL`, its title, file and properties; in this file, the call of its reader, and its
 //! recognition unless a file identifies the format. Readers share the modules `frame`,
 //! `photograph`, `text` and `lookup`, which finds files. `masks` finds masks next to images;
-//! `nearby` and `conversion` explain why a folder is no data set.
+//! `nearby` and `conversion` explain why a folder is no data set. [`Border`] classifies the border
+//! of an image.
 //!
 //! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left
 //! corner, scene units) with lens distortion; [`Frame::photograph`] reads the image, and turns it
@@ -24,6 +25,7 @@
 //! ```
 
 mod blender;
+mod border;
 mod colmap;
 mod conversion;
 mod dataset;
@@ -53,6 +55,7 @@ use std::path::Path;
 use anyhow::bail;
 use artifact::printable;
 
+pub use border::{Border, plain_background};
 pub use dataset::Dataset;
 pub use error::DatasetError;
 use file_status::{is_file, path_text};

@@ -22,6 +22,14 @@ impl Rgba8 {
         assert_eq!(data.len(), width * height * 4, "an RGBA image has four samples a pixel");
         Self { width, height, data }
     }
+
+    /// Returns the colour of a pixel.
+    ///
+    /// # Panics
+    /// If the pixel is outside the image.
+    pub fn colour(&self, x: usize, y: usize) -> [u8; 3] {
+        std::array::from_fn(|c| self.data[4 * (y * self.width + x) + c])
+    }
 }
 
 /// Converts a decoded image; without alpha it is opaque.

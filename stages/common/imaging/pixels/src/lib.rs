@@ -15,6 +15,7 @@
 //! * [`Mask`]: pixels of an image that count.
 //! * [`sample_cubic`], [`Image::colour_at`]: cubic interpolation.
 //! * [`psnr_of`]: a mean squared error in dB.
+//! * [`medians`], [`are_similar`]: comparisons of 8-bit colours.
 //! * [`palette_colour`]: colour scales of depth and error maps.
 //!
 //! Colours are display-encoded sRGB in [0, 1] throughout.
@@ -37,6 +38,7 @@ mod mask;
 mod operator;
 mod pillow_resample;
 mod png_file;
+mod similar;
 
 pub use colour::{Palette, linear_from_srgb, palette_colour, srgb_from_linear, to_u8};
 pub use cubic::sample_cubic;
@@ -53,3 +55,4 @@ pub use mask::{MIN_BRIGHT_LEVEL, Mask};
 pub use operator::{AxisTaps, Resampling};
 pub use pillow_resample::{Filter, resize_pillow};
 pub use png_file::{PngRows, encode_png, read_png, write_png};
+pub use similar::{are_similar, count_similar, medians};

@@ -14,6 +14,7 @@ mod text;
 mod work;
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use planning::{Node, Origin, Plan, State, nearest_record};
 use serde_json::{Map, Value, json};
@@ -21,9 +22,8 @@ use store::{ModelCost, Record, Store, host_name};
 
 pub(crate) use text::{check_memory, comparison_text, run_text, total_comparison_text};
 
-use crate::planned::Planned;
 use costs::{min_memory, model_cost, slowness};
-use scene::{SceneImages, computed_frames, recorded_frames};
+use scene::{PlannedDataset, SceneImages, computed_frames, recorded_frames};
 use work::{Images, Work};
 
 /// Minimum processor seconds of an earlier run that corrects an estimate, and maximum factor
@@ -61,14 +61,13 @@ pub(crate) struct Estimates {
 
 impl Estimates {
     /// Estimates the nodes of a plan.
-    pub(crate) fn new(planned: &Planned<'_>) -> Self {
-        let Planned { plan, states, .. } = planned;
+    pub(crate) fn new(plan: &Plan, states: &[State], store: &Store) -> Self {
         let is_cached = |state: &State| matches!(state, State::Cached(_));
         if states.iter().all(is_cached) {
             // A run with nothing to do reads nothing.
             return Self::default();
         }
-        let estimator = Estimator::new(planned);
+        let estimator = Estimator::new(plan, states, store);
         let missing = states.iter().enumerate().filter(|(_, state)| !is_cached(state));
         let nodes: BTreeMap<usize, Estimate> = missing
             .clone()
@@ -94,12 +93,12 @@ struct Estimator<'a> {
 }
 
 impl<'a> Estimator<'a> {
-    fn new(planned: &'a Planned<'_>) -> Self {
-        let Planned { store, plan, states } = planned;
+    fn new(plan: &'a Plan, states: &[State], store: &Store) -> Self {
         let mut scenes = BTreeMap::new();
+        let mut datasets = BTreeMap::new();
         for (index, node) in plan.nodes.iter().enumerate() {
             if node.program.description.name == "prep"
-                && let Some(images) = scene_images(plan, &states[index], node, store)
+                && let Some(images) = scene_images(plan, &states[index], node, store, &mut datasets)
             {
                 scenes.insert(index, images);
             }
@@ -263,14 +262,24 @@ fn parent<'n>(node: &'n Node, input: &str) -> Option<(usize, Option<&'n str>)> {
     }
 }
 
-/// Returns the images that a node of `prep` has made or will make.
-fn scene_images(plan: &Plan, state: &State, prep: &Node, store: &Store) -> Option<SceneImages> {
+/// Returns the images that a node of `prep` has made or will make. `datasets` has the data sets that
+/// were read already.
+fn scene_images<'p>(
+    plan: &'p Plan,
+    state: &State,
+    prep: &'p Node,
+    store: &Store,
+    datasets: &mut BTreeMap<&'p Path, Option<PlannedDataset>>,
+) -> Option<SceneImages> {
     if let State::Cached(record) = state {
         return SceneImages::of_artifact(&store.object(&record.output));
     }
     let dataset = prep.inputs.iter().find(|input| input.name == "dataset")?;
     match &dataset.from {
-        Origin::Folder(folder) => SceneImages::of_dataset(folder, &prep.parameters),
+        Origin::Folder(folder) => {
+            let set = datasets.entry(folder).or_insert_with(|| PlannedDataset::read(folder));
+            SceneImages::of_dataset(set.as_mut()?, &prep.parameters)
+        }
         Origin::Node { index, .. } => {
             let demo = &plan.nodes[*index];
             SceneImages::of_demo(&demo.parameters, &prep.parameters)

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use artifact::format_count;
-use dataset::{Dataset, Format, Split};
+use dataset::{Border, Dataset, Format, Split};
 use pixels::{DEGRADATION_FILE, Filter, Kernel};
 use scene::{Background, Intrinsics, Space, VIEWS_FILE, Views};
 use serde::Deserialize;
@@ -50,6 +50,43 @@ struct PlannedScene {
     is_benchmark: bool,
 }
 
+/// Data set that `prep` will read.
+pub(crate) struct PlannedDataset {
+    dataset: Dataset,
+    /// Cached result of [`Self::is_opaque`].
+    is_opaque: Option<bool>,
+}
+
+/// Maximum number of photographs that are read for an estimate; chosen by hand. The first one
+/// suffices for most opaque scenes, and for photographs with alpha.
+const MAX_SAMPLES: usize = 3;
+
+impl PlannedDataset {
+    /// Reads a data set; `None` if `prep` will refuse it.
+    pub(crate) fn read(folder: &Path) -> Option<Self> {
+        Some(Self { dataset: Dataset::read(folder).ok()?, is_opaque: None })
+    }
+
+    /// Predicts from the borders of a few photographs whether `prep` will take the scene as opaque.
+    fn is_opaque(&mut self) -> bool {
+        let frames = &self.dataset.frames;
+        *self.is_opaque.get_or_insert_with(|| {
+            let count = frames.len().min(MAX_SAMPLES);
+            for sample in 0..count {
+                let frame = &frames[sample * frames.len() / count];
+                // A photograph that can't be read is reported by `prep`.
+                let border = frame.photograph().map(|image| Border::of_frame(frame, &image));
+                match border {
+                    Ok(Border::Alpha) => return false,
+                    Ok(border) if border.background().is_some() => {}
+                    _ => return true,
+                }
+            }
+            false
+        })
+    }
+}
+
 impl SceneImages {
     /// Reads the images of an existing artifact.
     pub(crate) fn of_artifact(artifact: &Path) -> Option<Self> {
@@ -75,20 +112,19 @@ impl SceneImages {
     }
 
     /// Predicts the images that `prep` makes of a data set.
-    pub(crate) fn of_dataset(folder: &Path, parameters: &Value) -> Option<Self> {
-        let set = Dataset::read(folder).ok()?;
+    pub(crate) fn of_dataset(set: &mut PlannedDataset, parameters: &Value) -> Option<Self> {
+        let is_opaque = match parameters["background"].as_str() {
+            Some(background) => background == "opaque",
+            None => set.is_opaque(),
+        };
+        let set = &set.dataset;
         let all = set.frames.len();
-        let split = match (parameters["split"].as_str(), set.split) {
+        let split = match (parameters["split"].as_str(), &set.split) {
             // Approximate: `prep` removes the references from these test views.
             (Some("paper"), _) => Split::all(all),
             (Some("holdout"), _) | (_, None) => Split::hold_out(all),
-            (_, Some(split)) => split,
+            (_, Some(split)) => split.clone(),
         };
-        let background = parameters["background"].as_str();
-        // Only Blender's images are taken as objects. `prep` would also take images with alpha as
-        // objects; their pixels aren't read here.
-        let is_object = set.format == Format::Blender;
-        let is_opaque = background.map_or(!is_object, |background| background == "opaque");
         let space = parameters["space"].as_str();
         let is_ndc = space.map_or(set.format == Format::Llff, |space| space == "ndc");
         let planned = PlannedScene {

@@ -1,5 +1,6 @@
 //! The local executor: runs nodes whose parents are done, several at once, and then the sinks.
 
+use std::borrow::Cow;
 use std::cell::OnceCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::ExitCode;
@@ -14,7 +15,7 @@ use store::Record;
 
 use super::budget::{Admission, Budget, Demand};
 use super::node::{Lookup, NodeJob, PendingAction, input_folder};
-use crate::estimates::{check_memory, run_text, total_comparison_text};
+use crate::estimates::{Estimates, check_memory, run_text, total_comparison_text};
 use crate::run_messages::{command_text, end_message, failure_message};
 use crate::run_record::RunProgress;
 use crate::session::{Run, command_line};
@@ -137,6 +138,7 @@ fn run_nodes(run: &Run<'_>, options: &Local) -> NodesOutcome {
         ready: BTreeMap::new(),
         running: BTreeMap::new(),
         records: OnceCell::new(),
+        estimates: Cow::Borrowed(run.estimates),
         progress: RunProgress {
             records: vec![None; count],
             ran: Some(BTreeSet::new()),
@@ -177,6 +179,8 @@ struct Schedule<'a> {
     running: BTreeMap<usize, Demand>,
     /// All records of the store, read when the first node isn't cached.
     records: OnceCell<Vec<Record>>,
+    /// Expected costs of the nodes, as far as known.
+    estimates: Cow<'a, Estimates>,
     progress: RunProgress,
 }
 
@@ -207,7 +211,7 @@ impl<'a> Schedule<'a> {
             .collect();
         let threads = self.options.budget.cores;
         let (run, display) = (self.run, self.display);
-        let estimate = run.estimates.nodes.get(&index).copied();
+        let estimate = self.estimates.nodes.get(&index).copied();
         NodeJob { run, node, parents, threads, display, estimate, watch: None }
     }
 
@@ -291,9 +295,22 @@ impl<'a> Schedule<'a> {
                 self.progress.records[index] = Some(record);
                 if ran {
                     self.progress.ran.get_or_insert_default().insert(index);
+                    if self.run.plan.nodes[index].program.description.name == "prep" {
+                        self.estimate_again();
+                    }
                 }
             }
             Err(error) => self.fail(index, &error),
+        }
+    }
+
+    /// Estimates the remaining nodes again, from the scene that `prep` has made: before, its
+    /// background was a guess.
+    fn estimate_again(&mut self) {
+        let Run { plan, store, .. } = self.run;
+        // Without the nodes' states, the earlier estimates stay.
+        if let Ok(states) = plan.states(store, None) {
+            self.estimates = Cow::Owned(Estimates::new(plan, &states, store));
         }
     }
 

@@ -4,7 +4,7 @@ use artifact::{format_count, format_duration, format_size, print_line};
 use planning::{Plan, Quality, Request};
 use slurm::Memory;
 
-use crate::estimates::{Estimate, Estimates};
+use crate::estimates::Estimate;
 use crate::run_messages::command_text;
 use crate::session::Session;
 
@@ -155,7 +155,7 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
     let mut request = request.clone();
     request.parameters.push(format!("quality={}", quality.name()));
     let planned = session.plan_with_states(&request)?;
-    let estimates = Estimates::new(&planned);
+    let estimates = planned.estimates();
     if quality == Quality::ALL[0] {
         for scene in &estimates.scenes {
             print_line!("{scene}");
@@ -193,7 +193,7 @@ fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Co
     let targets = vec![REFINING_TARGET.to_owned()];
     let request = Request { targets, ..request.clone() };
     let refined = session.plan_with_states(&request).ok()?;
-    let estimates = Estimates::new(&refined);
+    let estimates = refined.estimates();
     let is_new = |index: &usize| {
         let new = &refined.plan.nodes[*index];
         !plan.nodes.iter().any(|node| (&node.stage, &node.point) == (&new.stage, &new.point))
