@@ -12,6 +12,17 @@ use common::{Project, data, root};
 
 /// Columns that identify a row.
 const KEY_COLUMNS: [&str; 5] = ["protocol", "method", "scene", "has seen", "gain"];
+/// Columns that depend on the machine and its load.
+const RUN_COLUMNS: [&str; 8] = [
+    "training",
+    "training, processor",
+    "rendering",
+    "seconds per view",
+    "peak memory, MB",
+    "front",
+    "commit",
+    "machine",
+];
 /// The documents' protocols, for images of 48 pixels.
 const SMALL_PROTOCOLS: &str = "  presets:
     100x2: {lr_width: 24, prep.scale: 2}
@@ -130,6 +141,17 @@ fn keys(columns: &[String], row: &[String]) -> Vec<String> {
         .collect()
 }
 
+/// Returns the cells of a table's lines that a repetition must reproduce, by row.
+fn reproducible(lines: &[&str]) -> Vec<Vec<String>> {
+    let columns = cells(lines[0]);
+    let is_reproducible = |column: usize| !RUN_COLUMNS.contains(&columns[column].as_str());
+    let row = |line: &&str| {
+        let cells = cells(line).into_iter().enumerate();
+        cells.filter(|(column, _)| is_reproducible(*column)).map(|(_, cell)| cell).collect()
+    };
+    lines.iter().map(row).collect()
+}
+
 /// Creates a project with the demo scene under the names of the documents' scenes; returns `None`
 /// without the data folder.
 fn project() -> Option<Project> {
@@ -200,8 +222,18 @@ fn has_comment_and_columns(
     *before == comment.trim_end() && cells(lines[0]) == columns
 }
 
-/// Copies tables that the commands generated at full budgets into the documents. Tables whose
-/// command hasn't run stay unchanged.
+#[test]
+fn times_and_commits_need_not_be_reproduced() {
+    let table = |row| ["| scene | PSNR | training | commit |", "| --- | --- | --- | --- |", row];
+    let first = table("| lego | **30.52** | 3.7 min | efbcb72 |");
+    let again = table("| lego | 30.52 | **4.1 min** | 40f9c9b |");
+    assert_eq!(reproducible(&first), reproducible(&again));
+    let better = table("| lego | 30.53 | 3.7 min | efbcb72 |");
+    assert_ne!(reproducible(&first), reproducible(&better));
+}
+
+/// Copies tables that the commands generated at full budgets into the documents. A table stays
+/// unchanged if its command hasn't run, or has the same results again.
 #[test]
 fn what_was_measured_is_put_into_the_documents() {
     if std::env::var_os("UPDATE").is_none() {
@@ -219,18 +251,18 @@ fn what_was_measured_is_put_into_the_documents() {
                 continue;
             };
             let comment = format!("<!-- nerf-sr {} -->\n", table.arguments.join(" "));
-            let old = tables(&text)
+            let (_, old) = tables(&text)
                 .into_iter()
                 .find(|candidate| has_comment_and_columns(candidate, &comment, &table.columns))
-                .unwrap()
-                .1
-                .join("\n");
-            text = text.replacen(
-                &format!("{comment}{old}"),
-                &format!("{comment}{}", lines.join("\n")),
-                1,
-            );
-            println!("{}: {}", path.display(), table.file().display());
+                .unwrap();
+            let place = format!("{}: {}", path.display(), table.file().display());
+            if reproducible(&old) == reproducible(&lines) {
+                println!("{place}: equal results");
+                continue;
+            }
+            let [old, new] = [old, lines].map(|lines| format!("{comment}{}", lines.join("\n")));
+            text = text.replacen(&old, &new, 1);
+            println!("{place}");
         }
         std::fs::write(&path, text).unwrap();
     }
