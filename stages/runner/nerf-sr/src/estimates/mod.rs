@@ -278,7 +278,7 @@ fn scene_images<'p>(
     match &dataset.from {
         Origin::Folder(folder) => {
             let set = datasets.entry(folder).or_insert_with(|| PlannedDataset::read(folder));
-            SceneImages::of_dataset(set.as_mut()?, &prep.parameters)
+            SceneImages::of_dataset(set.as_ref()?, &prep.parameters)
         }
         Origin::Node { index, .. } => {
             let demo = &plan.nodes[*index];

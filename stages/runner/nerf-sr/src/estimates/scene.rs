@@ -1,5 +1,6 @@
 //! Images of a scene, from an artifact of `prep` or from the data set that `prep` will read.
 
+use std::cell::OnceCell;
 use std::path::Path;
 
 use artifact::format_count;
@@ -53,8 +54,8 @@ struct PlannedScene {
 /// Data set that `prep` will read.
 pub(crate) struct PlannedDataset {
     dataset: Dataset,
-    /// Cached result of [`Self::is_opaque`].
-    is_opaque: Option<bool>,
+    /// Result of [`Self::is_opaque`], once computed.
+    is_opaque: OnceCell<bool>,
 }
 
 /// Maximum number of photographs that are read for an estimate; chosen by hand. The first one
@@ -64,13 +65,13 @@ const MAX_SAMPLES: usize = 3;
 impl PlannedDataset {
     /// Reads a data set; `None` if `prep` will refuse it.
     pub(crate) fn read(folder: &Path) -> Option<Self> {
-        Some(Self { dataset: Dataset::read(folder).ok()?, is_opaque: None })
+        Some(Self { dataset: Dataset::read(folder).ok()?, is_opaque: OnceCell::new() })
     }
 
     /// Predicts from the borders of a few photographs whether `prep` will take the scene as opaque.
-    fn is_opaque(&mut self) -> bool {
+    fn is_opaque(&self) -> bool {
         let frames = &self.dataset.frames;
-        *self.is_opaque.get_or_insert_with(|| {
+        *self.is_opaque.get_or_init(|| {
             let count = frames.len().min(MAX_SAMPLES);
             for sample in 0..count {
                 let frame = &frames[sample * frames.len() / count];
@@ -112,7 +113,7 @@ impl SceneImages {
     }
 
     /// Predicts the images that `prep` makes of a data set.
-    pub(crate) fn of_dataset(set: &mut PlannedDataset, parameters: &Value) -> Option<Self> {
+    pub(crate) fn of_dataset(set: &PlannedDataset, parameters: &Value) -> Option<Self> {
         let is_opaque = match parameters["background"].as_str() {
             Some(background) => background == "opaque",
             None => set.is_opaque(),
