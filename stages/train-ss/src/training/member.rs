@@ -114,7 +114,8 @@ impl<'a> Member<'a> {
         Ok(log)
     }
 
-    /// Copies the weights that an earlier run finished to the output, and returns their log.
+    /// Copies an earlier run's finished weights to the output, and returns the training's log;
+    /// `None` if there are none.
     fn copy_finished(&self) -> Option<TrainingLog> {
         let work = self.work.as_ref()?;
         let log = serde_json::from_slice(&std::fs::read(work.join(TRAINING_FILE)).ok()?).ok()?;

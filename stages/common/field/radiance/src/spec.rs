@@ -11,11 +11,11 @@ pub const HASH_FACTORS: [u32; 2] = [2_654_435_761, 805_459_861];
 /// Number of outputs of the density network: raw density, raw red, green and blue, view features.
 pub const DENSITY_OUTPUTS: usize = 16;
 /// Index of the first raw colour among the density network's outputs.
-pub const RAW_COLOUR: usize = 1;
+pub const FIRST_RAW_COLOUR: usize = 1;
 /// Index of the first view feature among the density network's outputs.
-pub const VIEW_FEATURE: usize = 4;
+pub const FIRST_VIEW_FEATURE: usize = 4;
 /// Number of view features. Composited along a ray, view features are inputs of the view network.
-pub const VIEW_FEATURES: usize = DENSITY_OUTPUTS - VIEW_FEATURE;
+pub const VIEW_FEATURES: usize = DENSITY_OUTPUTS - FIRST_VIEW_FEATURE;
 /// Number of spherical harmonics of a direction, up to degree 2.
 pub const BASIS: usize = 9;
 /// Number of inputs of the view network: view features and spherical harmonics.
