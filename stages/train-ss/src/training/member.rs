@@ -124,8 +124,8 @@ impl<'a> Member<'a> {
     }
 
     /// Trains the field to the end, with checkpoints, progress and a curve. If the photographs'
-    /// exposures turn out to differ, starts over with exposures: the field has begun to explain the
-    /// differences by floaters (design note 026).
+    /// exposures turn out to differ, starts over and estimates exposures: the field has begun to
+    /// explain the differences by floaters (design note 026).
     fn train(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         let with_exposures = self.with_exposures();
         if self.params.exposure == Exposure::ByScene && with_exposures.has_started() {
