@@ -57,8 +57,8 @@ pub const MIN_HIT_WEIGHT: f32 = 0.03;
 /// Decay rates of Adam's two moments (Müller et al. 2022). The second is below the usual 0.999,
 /// since a grid entry has a gradient in few steps.
 pub const ADAM_BETA: [f64; 2] = [0.9, 0.99];
-/// Numbers of low bits by which Adam's two moments are rounded, so that both of a weight take 32
-/// bits (docs/design/006).
+/// Numbers of low bits that are rounded off Adam's two moments, so that a weight's pair of moments
+/// takes 32 bits (docs/design/006).
 pub const ADAM_ROUNDED_BITS: [u32; 2] = [16, 15];
 /// Term that keeps Adam's denominator above 0 (Müller et al. 2022).
 pub const ADAM_EPSILON: f64 = 1e-15;
