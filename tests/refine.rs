@@ -151,8 +151,7 @@ fn views_are_consistent_with_their_own_photographs() {
     let paper_split = mean_lr_psnrs(&project, &["-p", "split=paper"]);
     assert!(paper_split[1] > paper_split[0] + 6.0, "{paper_split:?}");
     assert!(
-        refine_summary(&project, &["-p", "split=paper"])
-            .contains("consistent with their own photographs")
+        refine_summary(&project, &["-p", "split=paper"]).contains("consistent with LR photographs")
     );
     // The network is trained on consistent views, too, and warns about views without photographs.
     assert!(
@@ -856,7 +855,7 @@ fn the_papers_network_refines_by_references() {
     project.ok(&["run", "eval-paper"]);
     let folder = |stage: &str| project.artifact(stage, &["eval-paper"]);
     let summary = std::fs::read_to_string(folder("refine-paper").join("summary.txt")).unwrap();
-    assert!(summary.contains("3 views by 1 reference"), "{summary}");
+    assert!(summary.contains("3 views with 1 reference"), "{summary}");
     let (views, refiner) = (folder("render-depth"), folder("train-paper"));
     let file: serde_json::Value =
         serde_json::from_slice(&std::fs::read(refiner.join("refiner.json")).unwrap()).unwrap();

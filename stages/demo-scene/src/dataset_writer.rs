@@ -48,7 +48,7 @@ impl Form {
     }
 }
 
-/// Returns the path of a test view's depth in Blender's format.
+/// Returns the path of a test view's depth, for the data set's format `blender`.
 fn depth_path(number: usize) -> String {
     format!("test/r_{number}_depth.exr")
 }

@@ -46,8 +46,8 @@ pub struct DemoScene;
 impl Stage for DemoScene {
     type Params = Params;
     const NAME: &'static str = "demo-scene";
-    const SUMMARY: &'static str =
-        "Renders a small procedural scene as a data set, with exact depth in Blender's format.";
+    const SUMMARY: &'static str = "Renders a small procedural scene as a data set; with \
+        `form: blender`, test views have exact depth.";
 
     fn output() -> Output {
         Output::kind("dataset")

@@ -20,7 +20,7 @@ pub struct Params {
     /// Number of training views.
     #[schemars(range(min = 1, max = 1000))]
     pub train: u32,
-    /// Number of test views; they have depth in Blender's format.
+    /// Number of test views. With `form: blender`, they have depth.
     #[schemars(range(min = 1, max = 1000))]
     pub test: u32,
     /// Number of rays along each side of a pixel, against aliasing.

@@ -10,8 +10,9 @@ use crate::image_plan::ImagePlan;
 const BLOCK_SIDE: usize = 32;
 /// Maximum number of measured blocks of an image; chosen by hand.
 const MAX_BLOCKS: usize = 256;
-/// Divisor of the number of blocks: of the quarter of largest variance, at most [`MAX_BLOCKS`] are
-/// measured, evenly spaced. Smooth areas have no detail.
+/// Divisor of the number of blocks: only the quarter of largest variance is considered, since
+/// smooth areas have no detail. At most [`MAX_BLOCKS`] blocks of this quarter are measured, at even
+/// steps in the order of variance.
 const MEASURED_DIVISOR: usize = 4;
 /// Frequencies that fix the expected spectrum.
 const REFERENCE_FREQUENCIES: [usize; 2] = [2, 3];

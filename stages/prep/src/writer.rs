@@ -97,9 +97,11 @@ impl<'a> SceneWriter<'a> {
         )
     }
 
-    /// Writes the views of `train`, the LR images, of `downscaled`, LR images shrunk once more with
-    /// the LR images as ground truth, of `train-cameras`, the training cameras at HR size, and, if
-    /// there are any, of `references`, training views at HR size.
+    /// Writes the lists of views of the training frames:
+    /// * `train`: LR images;
+    /// * `downscaled`: LR images shrunk once more, whose ground truth is `train`;
+    /// * `train-cameras`: training cameras at HR size, without images;
+    /// * `references`, if there are any: training views at HR size.
     fn write_views_of_training_frames(&self) -> anyhow::Result<()> {
         let ScenePlan { train, references, images, .. } = self.plan;
         let lr_views = || train.iter().map(|frame| self.training_view(frame));
@@ -143,8 +145,9 @@ impl<'a> SceneWriter<'a> {
         View::camera_only(self.plan.images.hr_camera(&frame.camera()))
     }
 
-    /// Writes the views of `truth`, test views at HR size with their LR photographs, and of
-    /// `cameras`, their cameras.
+    /// Writes the lists of views of the test frames:
+    /// * `truth`: test views at HR size, with their LR photographs;
+    /// * `cameras`: test cameras at HR size, without images.
     fn write_views_of_test_frames(&self) -> anyhow::Result<()> {
         let ScenePlan { test, images, .. } = self.plan;
         self.write_views("cameras", test.iter().map(|frame| self.hr_view(frame)))?;

@@ -30,7 +30,7 @@ use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Stage};
 
 use enlarged::EnlargedPhotographs;
-use network::{AnyRefiner, Application};
+use network::{AnyRefiner, RefinementOptions};
 use references::{read_references, remove_misleading};
 use summary::Summary;
 use view::{RefineJob, RefinedView};
@@ -112,7 +112,7 @@ impl Stage for Refine {
             views_input,
             background: views.background.grey_level(),
             network: AnyRefiner::read(refiner, &file)?,
-            application: Application {
+            options: RefinementOptions {
                 residual_weight: file.residual_weight as f32,
                 self_ensemble: params.self_ensemble,
             },
@@ -157,7 +157,7 @@ fn refine_all(
         views: views.views.len(),
         consistent: 0,
         averaged: 0,
-        residual_weight: job.application.residual_weight,
+        residual_weight: job.options.residual_weight,
         has_reference_statistics: job.network.warp_options().is_some(),
         statistics: vec![ReferenceStatistics::default(); references.len()],
     };

@@ -15,7 +15,7 @@ pub(crate) enum AnyRefiner {
 }
 
 /// Settings for applying a network to every view.
-pub(crate) struct Application {
+pub(crate) struct RefinementOptions {
     /// Fraction of the predicted residual that is added: the best one for the validation views, or
     /// 1 for the paper's network.
     pub(crate) residual_weight: f32,
@@ -47,16 +47,17 @@ impl AnyRefiner {
         self.warp_options().is_some() || matches!(self, Self::Paper(..))
     }
 
-    /// Refines a view to colours in 0..1, and adds to each reference's `statistics`.
+    /// Refines a view; the result's colours are in 0..1. If the network warps references, adds each
+    /// reference's statistics in this view to `statistics`.
     pub(crate) fn refine(
         &self,
         rendered: &Rendered,
         references: &[KnownView],
-        application: &Application,
+        options: &RefinementOptions,
         statistics: &mut [ReferenceStatistics],
     ) -> anyhow::Result<Image> {
         let references: Vec<&KnownView> = references.iter().collect();
-        let &Application { residual_weight, self_ensemble } = application;
+        let &RefinementOptions { residual_weight, self_ensemble } = options;
         match self {
             Self::Compact(network) => {
                 let conditioned = self
@@ -65,14 +66,15 @@ impl AnyRefiner {
                 if let Some(conditioned) = &conditioned {
                     ReferenceStatistics::add_each(statistics, &conditioned.statistics);
                 }
-                let view = conditioned.as_ref().map_or(&rendered.view, |known| &known.view);
+                let view =
+                    conditioned.as_ref().map_or(&rendered.view, |conditioned| &conditioned.view);
                 Ok(network.refine_weighted(view, residual_weight, self_ensemble)?)
             }
             Self::Paper(network, patches) => {
-                let mut drawn =
+                let mut redrawn =
                     network.refine(rendered, &references, *patches).bad_input("input views")?;
-                blend(&rendered.view, &mut drawn, residual_weight);
-                Ok(drawn)
+                blend(&rendered.view, &mut redrawn, residual_weight);
+                Ok(redrawn)
             }
         }
     }

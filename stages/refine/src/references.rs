@@ -60,21 +60,22 @@ pub(crate) fn read_references(
 }
 
 /// Minimum confidence in a reference, relative to the confidence in the references that the network
-/// was trained with. With less, the reference's depth is tested (design note 018).
+/// was trained with. With less, the views' depths are tested (design note 018).
 const MIN_RELATIVE_CONFIDENCE: f64 = 0.75;
 
-/// Minimum ratio between the confidence in a reference and the confidence with all depths shifted
-/// by [`DEPTH_SHIFT`]. References with at least this ratio have correct depth (design note 018).
+/// Minimum ratio between the confidence in a reference and the confidence with the views' depths
+/// shifted by [`DEPTH_SHIFT`]. With at least this ratio, the depths are correct (design note 018).
 const MIN_DEPTH_SENSITIVITY: f64 = 1.1;
-/// Relative shift of depths in the test (design note 018).
+/// Relative shift of the views' depths in the test (design note 018).
 const DEPTH_SHIFT: f32 = 0.1;
 
 /// Maximum number of views, spread over all, by which references are judged; chosen by hand.
 const MAX_JUDGING_VIEWS: usize = 8;
 
 /// Removes references that disagree with the renders, and logs each removal as soon as the
-/// reference is judged. A reference with low confidence stays if confidence is even lower with
-/// shifted depths: then its depths are correct, and its surfaces look different from another angle.
+/// reference is judged. A reference with low confidence stays if shifted depths of the views lower
+/// the confidence further. Then these depths are correct, and surfaces look different from another
+/// angle.
 ///
 /// `confidence` is the confidence in the references that the network was trained with.
 pub(crate) fn remove_misleading(
@@ -123,14 +124,15 @@ impl ReferenceJudge<'_> {
             let name = &reference.rendered.camera.name;
             (self.log)(format!(
                 "reference {name} differs from the renders (confidence {:.0} %) and is left out: \
-                wrong depth, a wrong pose, or did something move?",
+                maybe its pose or the depth is wrong, or something moved",
                 100.0 * shares[i]
             ));
         }
         Ok(reliable)
     }
 
-    /// True if confidence in a reference is clearly lower with smaller and with larger depths.
+    /// True if confidence in a reference is clearly lower with smaller and with larger depths of
+    /// the views.
     fn has_correct_depth(&self, reference: &KnownView) -> anyhow::Result<bool> {
         // With shifted depths, the reference's own depth would hide every point.
         let warp_options = WarpOptions { occlusion: false };
@@ -141,8 +143,8 @@ impl ReferenceJudge<'_> {
         Ok(unshifted >= MIN_DEPTH_SENSITIVITY * f64::max(nearer, farther))
     }
 
-    /// Returns the confidence in each reference, relative to its visibility in the views, with all
-    /// depths multiplied by a factor.
+    /// Returns the confidence in each reference, relative to the reference's visibility in the
+    /// views. Multiplies the views' depths by a factor.
     fn confidence(
         &self,
         references: &[KnownView],

@@ -27,10 +27,10 @@ impl Summary {
             self.residual_weight
         );
         if self.averaged > 0 {
-            text += &format!("; {} averaged with their enlarged photographs", self.averaged);
+            text += &format!("; {} averaged with enlarged photographs", self.averaged);
         }
         if self.consistent > 0 {
-            text += &format!("; {} consistent with their own photographs", self.consistent);
+            text += &format!("; {} consistent with LR photographs", self.consistent);
         }
         text
     }
@@ -42,16 +42,16 @@ impl Summary {
         }
         let references = format_count(self.statistics.len(), "reference");
         if !self.has_reference_statistics {
-            return format!(" by {references}");
+            return format!(" with {references}");
         }
         let mut all = ReferenceStatistics::default();
         for reference in &self.statistics {
             all.add(reference);
         }
         if all.visible_pixels == 0 {
-            return format!(" by {references} that show no part of them");
+            return format!(" with {references} (visible in no view)");
         }
-        format!(" by {references} (confidence {:.0} %)", 100.0 * all.confidence_share())
+        format!(" with {references} (confidence {:.0} %)", 100.0 * all.confidence_share())
     }
 }
 
@@ -81,10 +81,10 @@ mod tests {
         };
         assert_eq!(
             by_references.text(),
-            "3 views by 2 references (confidence 50 %), residual weight 0.80; 1 averaged with \
-             their enlarged photographs; 2 consistent with their own photographs"
+            "3 views with 2 references (confidence 50 %), residual weight 0.80; 1 averaged with \
+             enlarged photographs; 2 consistent with LR photographs"
         );
         let hidden = Summary { statistics: vec![ReferenceStatistics::default()], ..by_references };
-        assert!(hidden.text().starts_with("3 views by 1 reference that show no part of them, "));
+        assert!(hidden.text().starts_with("3 views with 1 reference (visible in no view), "));
     }
 }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use stage::Context;
 
 use crate::enlarged::EnlargedPhotographs;
-use crate::network::{AnyRefiner, Application};
+use crate::network::{AnyRefiner, RefinementOptions};
 
 /// Reads a rendered view, and all channels of its file. Fails if the view has no depth and
 /// `needs_depth` is true.
@@ -38,7 +38,7 @@ pub(crate) struct RefineJob<'a> {
     pub(crate) views_input: &'a GivenInput,
     pub(crate) background: f32,
     pub(crate) network: AnyRefiner,
-    pub(crate) application: Application,
+    pub(crate) options: RefinementOptions,
     pub(crate) photographs: Option<LrObservations<'a>>,
     pub(crate) enlarged: Option<EnlargedPhotographs<'a>>,
     /// True if the network was trained on views consistent with their own LR photographs.
@@ -66,7 +66,7 @@ impl RefineJob<'_> {
         let ViewToRefine { rendered, file, photograph } = self.read(view)?;
         let mut statistics = vec![ReferenceStatistics::default(); references.len()];
         let mut refined =
-            self.network.refine(&rendered, references, &self.application, &mut statistics)?;
+            self.network.refine(&rendered, references, &self.options, &mut statistics)?;
         if let Some(enlarged) = &self.enlarged {
             refined = enlarged.average_with(refined, &view.camera)?;
         }

@@ -23,7 +23,8 @@ impl Scale {
     pub(crate) fn error(range: f64, at_lr: bool) -> Self {
         let subject = if at_lr { "Absolute error at LR" } else { "Absolute error" };
         let mut ticks = ticks(0.0, range);
-        // Larger errors have the brightest colour, too. Above 0.999 is the end, to rounding errors.
+        // Larger errors have the brightest colour, too. Because of rounding errors, a position
+        // above 0.999 counts as the end.
         if let Some((_, text)) = ticks.last_mut().filter(|(position, _)| *position > 0.999) {
             text.insert_str(0, "≥ ");
         }

@@ -62,8 +62,8 @@ impl Stage for TrainRefine {
                 Input::optional(
                     &cameras,
                     "cameras of the views to be refined (`net: compact` only); if each camera \
-                    has an LR photograph, the training views are made consistent with their LR \
-                    photographs, like the refined views",
+                    has an LR photograph, the training views are made consistent with their own \
+                    LR photographs, as `refine` will do with the refined views",
                 ),
             ),
             (

@@ -3,9 +3,9 @@
 //!
 //! * `params`: parameters, and defaults that depend on the scene ([`Params::resolve`]).
 //!   `supersample: 1` is plain NeRF on the same images.
-//! * `supersample`: the number of sub-pixel rays of an LR pixel, from the parameter to the warm-up.
+//! * `supersample`: the number of sub-pixel rays of an LR pixel, during and after the warm-up.
 //! * `photographs`: LR images and HR references, packed into memory and, beyond a budget, a file.
-//! * `silhouettes`: cells that photographs with alpha show empty.
+//! * `silhouettes`: cells that are empty according to photographs with alpha.
 //! * `state`: HR cache, exposures and poses, estimated in addition to the field.
 //! * `supervision`: drawn pixels, their rays and their loss: the paper's average (eq. 4), or the
 //!   kernel that made the LR images ([`Supersampling`]).

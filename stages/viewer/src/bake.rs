@@ -127,7 +127,8 @@ impl Baker<'_> {
         Ok(Shape { seen: spread_to_neighbours(&bricks, &seen), bricks, opacity })
     }
 
-    /// Adds to the opacity of each of a brick's voxels the mean over sources.
+    /// Adds the sources' mean opacity to each value of `opacity`, which has a value for each voxel
+    /// of a brick.
     fn add_opacities(&self, brick: [usize; 3], opacity: &mut [f32]) -> Result<(), RenderError> {
         let positions = sample_positions(brick, 0..VOXELS, self.resolution);
         let weight = 1.0 / self.sources.len() as f32;
@@ -434,7 +435,8 @@ pub(crate) mod tests {
             assert!(x.abs() < 0.01 || (voxel.colour[0] - red).abs() < 1e-3, "{voxel:?}");
             assert!((voxel.colour[2] - blue).abs() < 1e-3, "{voxel:?}");
         }
-        // Straight from above, where all cameras look: green is that of the direction.
+        // For the top voxel, which all cameras see, the logit of green in a camera's direction is
+        // the direction's z.
         let top = volume.voxels.iter().find(|v| v.position == [32, 32, 50]).unwrap();
         let logit = |c: f32| (c / (1.0 - c)).ln();
         for camera in cameras() {

@@ -11,7 +11,8 @@ use crate::space::to_world;
 const ELEVATION_SINE: f64 = 0.4;
 
 /// Returns centre and extent of the voxels, in scene units; of the box if there are no voxels. In a
-/// contracted space only voxels in the ball count, if there are any: the others have no size.
+/// contracted space, only voxels in the ball that isn't contracted count, if there are any.
+/// Contraction distorts sizes outside this ball.
 pub(crate) fn centre_and_size(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
     let resolution = volume.resolution as f64;
     let position = |v: &Voxel| DVec3::from(v.position.map(|c| (f64::from(c) + 0.5) / resolution));

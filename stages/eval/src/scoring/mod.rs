@@ -55,7 +55,8 @@ fn masked_psnr(render: &Image, truth: &Image, counted_share: f64) -> f64 {
     psnr(render, truth) + 10.0 * counted_share.log10()
 }
 
-/// Returns the end of the convention of a score that ignores masked pixels.
+/// Returns the last words of the convention of a score that ignores masked pixels; empty if no view
+/// has a mask.
 fn masked_note(scene: &ScoredScene<'_>) -> &'static str {
     let is_masked = scene.truth.views.iter().any(|view| view.mask.is_some());
     if is_masked { "; only pixels that no mask excludes" } else { "" }

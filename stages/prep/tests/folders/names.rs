@@ -162,7 +162,7 @@ pub(crate) fn cases() -> Vec<Case> {
             "an absolute path of nothing here",
             |folder| write_frames(folder, "/home/x/b_#.png", "images/a_#.png"),
             Expected::Refused(
-                "dataset: DIR/transforms.json: none of the 10 images exists (first missing: /home/x/b_0.png)",
+                "dataset: DIR/transforms.json: 10 images listed, none found (first missing: /home/x/b_0.png)",
             ),
         ),
         case(

@@ -78,7 +78,7 @@ fn place_cases() -> Vec<Case> {
             "images in another folder",
             |folder| write_colmap_set(folder, "sparse/0", "photos"),
             Expected::Refused(
-                "dataset: DIR/sparse/0/images.txt: none of the 3 images exists in DIR (first missing: a0.png); the image is in photos: rename this folder images",
+                "dataset: DIR/sparse/0/images.txt: 3 images listed, none found in DIR (first missing: a0.png); the image is in photos: rename this folder images",
             ),
         ),
         case(

@@ -74,7 +74,7 @@ pub(crate) fn cases() -> Vec<Case> {
                 write_copies(folder, "images_4/b#.png", (48, 32), 3);
             },
             Expected::Refused(
-                "dataset: DIR/sparse/0/images.txt: none of the 3 images exists in DIR (first missing: a0.jpg)",
+                "dataset: DIR/sparse/0/images.txt: 3 images listed, none found in DIR (first missing: a0.jpg)",
             ),
         ),
     ]

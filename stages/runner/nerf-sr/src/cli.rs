@@ -110,8 +110,8 @@ struct RunOptions {
     /// don't depend on the number [default: processors of this process]
     #[arg(long, value_name = "N", value_parser = positive_count)]
     threads: Option<NonZeroUsize>,
-    /// Memory limit for all stages together, such as 8G. A stage needs the peak memory of its last
-    /// run [default: all memory]
+    /// Memory limit for all stages together, such as 8G. A stage is assumed to need the peak memory
+    /// of its most similar measured run, or none without such a run [default: all memory]
     #[arg(long, value_name = "AMOUNT")]
     memory: Option<Memory>,
     /// Continue with stages that don't depend on a failed one

@@ -10,10 +10,11 @@ use store::{Record, Store};
 
 use crate::session::Run;
 
-/// Progress of a run; by default, that before its first stage.
+/// Progress of a run. The default lacks the entries of `records`.
 #[derive(Default)]
 pub(crate) struct RunProgress {
-    /// Records by node index; `None` if the node isn't done.
+    /// Records by node index, with an entry for each node of the plan; `None` if the node isn't
+    /// done.
     pub(crate) records: Vec<Option<Record>>,
     /// Nodes that ran; `None` if unknown.
     pub(crate) ran: Option<BTreeSet<usize>>,
@@ -71,7 +72,8 @@ pub(crate) fn run_record(
     if can_be_partial {
         failed.extend_from_slice(&sink.left_out);
     }
-    // JSON can't contain a path that isn't UTF-8. Without the path, tables don't name a commit.
+    // JSON can't contain a path that isn't UTF-8. Without the path, pages and tables don't name the
+    // folder's git commit.
     let pages_folder = std::path::absolute(run.out)
         .ok()
         .filter(|folder| folder.to_str().is_some())

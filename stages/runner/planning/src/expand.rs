@@ -167,8 +167,9 @@ impl<'a> Expansion<'a> {
         inputs
     }
 
-    /// Returns whether a setting applies to a stage: it is the stage's own. A block without a value
-    /// of its own takes the setting of the block that it extends.
+    /// Returns whether a setting applies to a stage. A quality applies to each stage whose program
+    /// has parameters of qualities. Any other setting applies to its own stage, and to blocks that
+    /// extend this stage without a value of their own.
     fn applies(&self, setting: &Setting, stage: &str) -> bool {
         if setting.kind == Kind::Quality {
             return self.programs.get(stage).is_some_and(Quality::affects);
@@ -239,8 +240,8 @@ impl<'a> Expansion<'a> {
         }
     }
 
-    /// Returns the reason for leaving out a stage at a point, and notes it: a missing file, its own
-    /// or a parent's.
+    /// Returns the reason for leaving out a stage at a point, if any: the stage's own file is
+    /// missing, or a parent is left out. Adds a note only if the stage's own file is missing.
     fn reason_to_leave_out(
         &mut self,
         stage: &str,

@@ -369,7 +369,7 @@ fn invalid_selections_are_refused() {
         (
             EXPERIMENT.split("  table:").next().unwrap().replace("[table]", "[score]"),
             &|c| c.show = vec!["score".to_owned()],
-            "--show selects inputs of sinks, but no target is a sink",
+            "--show selects results on pages and in tables, but no target shows results",
         ),
         (
             EXPERIMENT.replace("  variants:", "  needs: {scor: x}\n  variants:"),

@@ -64,7 +64,7 @@ pub struct StageBlock {
     /// The default is the block's name.
     pub run: Option<String>,
     /// Block whose program and parameters are inherited. Parameters of this block override
-    /// inherited ones, including those that the command line sets.
+    /// inherited ones, even those that the command line sets for the inherited block.
     pub extends: Option<String>,
     /// Inputs by name: a stage (`prep`), a subtree of its artifact (`prep/train`), or the path of a
     /// folder, which starts with `.` or `/`. `null` removes the input of an extended file's block.

@@ -16,7 +16,7 @@ use crate::node::Node;
 use crate::sources::path_text;
 
 /// Returns everything that may change a node's result, by name. Threads, paths, verbosity, host and
-/// the block's name are left out: they don't.
+/// the block's name are left out, since they don't change it.
 pub fn key_parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
     let description = &node.program.description;
     let mut parts = Map::new();

@@ -36,7 +36,8 @@ pub(crate) fn shown_stages<'a>(
     if is_explicit || !selected.is_empty() { selected } else { all }
 }
 
-/// Checks that the sinks among the targets have the inputs of `--show`.
+/// Checks that each name of `--show` is an input of a target sink, and that each target sink has
+/// one of these inputs.
 pub(crate) fn check_show(
     pipeline: &Pipeline,
     sinks: &[&str],
@@ -46,8 +47,8 @@ pub(crate) fn check_show(
         return Ok(());
     }
     if sinks.is_empty() {
-        let problem = "--show selects inputs of sinks, but no target is a sink; name one as \
-            target, such as report";
+        let problem = "--show selects results on pages and in tables, but no target shows \
+            results; add a target that does, such as report";
         return Err(PlanError::Usage(problem.to_owned()));
     }
     let names = sinks.iter().flat_map(|sink| {

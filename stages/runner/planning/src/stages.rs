@@ -90,8 +90,8 @@ impl Programs {
         self.0.iter().filter(|(_, program)| program.is_err()).map(|(stage, _)| stage.as_str())
     }
 
-    /// Creates the programs from given descriptions, by the name or path in the pipeline file.
-    /// Starts no program.
+    /// Creates the programs from descriptions, whose keys are the programs' names or paths in the
+    /// pipeline file. Starts no program.
     pub fn from_descriptions(
         pipeline: &Pipeline,
         descriptions: &BTreeMap<String, Description>,

@@ -63,8 +63,8 @@ async fn push_records(
     if skipped > 0 {
         let actions = format_count(skipped, "action");
         report_line!(
-            "{actions} skipped: their artifacts are incomplete in this store; \
-            `nerf-sr verify --remove`, then run again"
+            "{actions} skipped because artifacts are incomplete in this store; \
+            remove them by `nerf-sr verify --remove`, then run again"
         );
     }
     let actions = by_output.values().map(Vec::len).sum();

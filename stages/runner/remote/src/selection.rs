@@ -86,8 +86,8 @@ pub(crate) fn find_unique<'a>(
     let problem = match found.len() {
         1 => return Ok(found.into_iter().cloned().collect()),
         0 => format!(
-            "{location}: no {noun} {start:?}; where it was computed, `nerf-sr status --json` lists \
-            keys and hashes"
+            "{location}: no {noun} {start:?}; on the machine that computed it, `nerf-sr status \
+            --json` lists keys and hashes"
         ),
         count => {
             format!("{location}: {count} matches for {noun} {start:?}; give more characters")

@@ -46,8 +46,8 @@ impl Period {
     }
 }
 
-/// Parses numbers with units, larger units first, to a sum; `None` for other texts and for 0, which
-/// Slurm reads as all memory of a node.
+/// Parses numbers with units, larger units first, to a sum. Returns `None` for other texts, and for
+/// 0, which Slurm reads as all memory of a node or as no time limit.
 fn parse_sum(text: &str, units: &[(char, u64)]) -> Option<u64> {
     let mut units = units.iter();
     let mut sum = 0u64;

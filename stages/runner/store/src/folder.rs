@@ -17,8 +17,12 @@ use crate::error::{StoreError, if_found, with_path};
 /// locks/KEY             one OS lock per key, which the kernel releases when the process ends
 /// runs/ID.jsonl         actions that a run needs, written during the run
 /// pins/NAME.jsonl       actions that are kept until unpinned
-/// gate                  reader-writer lock: runs hold it briefly as readers, garbage collection as
-/// the writer
+/// gate                  reader-writer lock: runs hold it briefly as readers, garbage collection
+///                       as the writer
+/// sinks/ID/             temporary files of a run's sinks and of `run --watch`
+/// slurm/ID/             tasks that a run submitted to a cluster
+/// cache/                programs' descriptions, and hashes of input folders outside the store
+/// trash/                files and folders that are about to be deleted
 /// format                version of this layout
 /// ```
 ///

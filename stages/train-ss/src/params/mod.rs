@@ -53,10 +53,10 @@ pub struct Params {
     pub supervision: Option<Supervision>,
     /// Estimates a gain for red, green and blue of each photograph, for photographs with several
     /// exposures or white balances. Rendered views have the mean exposure of the photographs.
-    /// Default: the first 512 steps measure the gains. If the gains differ by more than a limit,
-    /// usually 2 to 4 % (a fifth of the field's relative error), training starts over with
-    /// exposures. Fine-tuning (input `init`) follows the initial field. The default is
-    /// false for `field: mlp`, background `alpha` and `pose_refinement`.
+    /// Default: false with `field: mlp`, background `alpha` or `pose_refinement`; otherwise the
+    /// first 512 steps measure the gains. If the gains differ by more than a limit, training starts
+    /// over and estimates them. The limit, usually 2 to 4 %, is a fifth of the field's relative
+    /// error. In fine-tuning (input `init`), the default is the initial field's choice.
     #[schemars(extend("x-group" = "data", "x-default" = BY_SCENE))]
     pub exposure: Option<bool>,
     /// Optimises camera poses during training, for poses that aren't exact. Trains the first field
@@ -156,8 +156,8 @@ pub struct GridParams {
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
     pub pixel_importance: f64,
     /// Samples along the diagonal of the unit cube. Default: 256 in NDC, where every ray crosses
-    /// the whole cube; otherwise 512. Fewer for `cells_per_pixel` below 2.56: in proportion
-    /// or, in NDC, with the power of 1.5.
+    /// the whole cube; otherwise 512. Below a `cells_per_pixel` of 2.56, the default falls in
+    /// proportion to `cells_per_pixel` or, in NDC, to its power of 1.5.
     #[schemars(range(min = 16, max = 8192), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub march_steps: Option<u32>,
     /// Weight of the distortion loss, which concentrates the sample weights along a ray. Default:

@@ -67,8 +67,8 @@ pub(crate) struct TrainingView {
 
 /// Comparison of a bundle's colours with a photograph.
 enum Comparison<'a> {
-    /// Compares the LR pixels that the kernel makes of rays and cached HR pixels with the
-    /// photograph's.
+    /// Compares the photograph with the LR pixels that the kernel computes from rays and cached HR
+    /// pixels.
     Kernel(&'a HrCache),
     /// Compares each ray with a pixel of the reference.
     Reference(&'a PackedPhotograph),

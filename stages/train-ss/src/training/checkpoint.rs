@@ -136,8 +136,8 @@ impl Checkpoints {
     }
 }
 
-/// Writes a checkpoint and removes the previous one. Each file appears complete, since a run that
-/// stops before its first step writes the files of the checkpoint from which it resumed.
+/// Writes a checkpoint and removes the previous one. Each file is replaced atomically: a run
+/// interrupted before its first step overwrites the files of the checkpoint from which it resumed.
 fn write(
     folder: &Path,
     trainer: &dyn FieldTrainer,
@@ -173,8 +173,9 @@ fn publish(partial: &Path, path: &Path) -> std::io::Result<()> {
     std::fs::rename(partial, path)
 }
 
-/// Restores a trainer from the latest checkpoint below a work folder and returns its curve; `None`
-/// if there is no complete checkpoint, for example while one replaces the other.
+/// Restores a trainer from the latest checkpoint below a work folder, and returns the checkpoint's
+/// curve. Returns `None` if there is no checkpoint, or if the latest is incomplete, for example
+/// while a new checkpoint replaces it.
 pub(crate) fn read_latest(work: &Path, trainer: &mut dyn FieldTrainer) -> Option<Curve> {
     let files = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
     let latest = files

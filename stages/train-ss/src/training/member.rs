@@ -114,7 +114,8 @@ impl<'a> Member<'a> {
         Ok(log)
     }
 
-    /// Copies the weights that an earlier run finished to the output, and returns their log.
+    /// Copies an earlier run's finished weights to the output, and returns the training's log;
+    /// `None` if there are none.
     fn copy_finished(&self) -> Option<TrainingLog> {
         let work = self.work.as_ref()?;
         let log = serde_json::from_slice(&std::fs::read(work.join(TRAINING_FILE)).ok()?).ok()?;
@@ -123,8 +124,8 @@ impl<'a> Member<'a> {
     }
 
     /// Trains the field to the end, with checkpoints, progress and a curve. If the photographs'
-    /// exposures turn out to differ, starts over with exposures: the field has begun to explain the
-    /// differences by floaters (design note 026).
+    /// exposures turn out to differ, starts over and estimates exposures: the field has begun to
+    /// explain the differences by floaters (design note 026).
     fn train(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         let with_exposures = self.with_exposures();
         if self.params.exposure == Exposure::ByScene && with_exposures.has_started() {

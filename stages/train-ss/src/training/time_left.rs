@@ -21,7 +21,7 @@ const COURSE: [(f64, f64); 9] = [
 ];
 /// Minimum number of steps over which the current pace is averaged; chosen by hand.
 const MIN_WINDOW_STEPS: f64 = 32.0;
-/// Number of steps taken over those in the averaging window; chosen by hand.
+/// Number of steps taken, divided by the number of steps in the averaging window; chosen by hand.
 const STEPS_PER_WINDOW_STEP: f64 = 8.0;
 /// Number of parts of growing size in which the remaining rays are predicted; chosen by hand.
 const PARTS: u32 = 64;

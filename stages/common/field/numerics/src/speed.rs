@@ -81,7 +81,7 @@ kernel! {
 }
 
 kernel! {
-    /// Sums table entries at hashed indices.
+    /// Adds table entries at hashed indices to `sum`, which is halved before each addition.
     fn read_table<L>(table: &[[f32; 4]], sum: &mut [f32; 4]) {
         let mut total = L::Quad::load(sum);
         let half = L::Quad::splat(0.5);
@@ -98,7 +98,8 @@ mod tests {
     use super::*;
     use crate::simd::test_every_family;
 
-    /// Each output of a layer sums 64 products, and the sum of table entries converges.
+    /// Each output of a layer sums 64 products, and the repeatedly halved sum of table entries
+    /// converges.
     #[test]
     fn every_family_has_equal_results() {
         let mut results = Vec::new();

@@ -9,8 +9,8 @@ const ALIGNMENT: usize = BRICK * FEATURES * size_of::<f32>();
 const MAX_PADDING: usize = ALIGNMENT / size_of::<f32>() - 1;
 
 /// Growable array of floats, or of other elements of 32 bits, that is aligned to bricks, so that a
-/// vector is in one cache line and a brick in two. A large `Vec` usually begins 16 bytes after a
-/// page boundary: vectors would be in two cache lines and bricks in three.
+/// SIMD vector of 16 elements is in one cache line and a brick in two. A large `Vec` usually begins
+/// 16 bytes after a page boundary: SIMD vectors would be in two cache lines and bricks in three.
 ///
 /// Large pages are requested from the system: samples access tables of many MiB at random, and the
 /// processor's TLB has few entries.

@@ -9,8 +9,8 @@ use crate::occupancy::cell_at;
 use crate::samples::DensityRows;
 use crate::shading::view_network;
 use crate::spec::{
-    DENSITY_OUTPUTS, MAX_RAW_DENSITY, OCCUPANCY_CELLS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES,
-    VIEW_INPUTS,
+    DENSITY_OUTPUTS, FIRST_RAW_COLOUR, FIRST_VIEW_FEATURE, MAX_RAW_DENSITY, OCCUPANCY_CELLS,
+    VIEW_FEATURES, VIEW_INPUTS,
 };
 use numerics::simd::LANES;
 
@@ -47,8 +47,8 @@ pub trait PointField: Sync {
     /// Evaluates density, raw colour and view features.
     fn samples(&self, points: &[[f32; 3]]) -> Result<PointSamples, RenderError>;
 
-    /// Computes the view-dependent part of raw colours for each row of `features`, in the unit
-    /// directions of the world at the same index.
+    /// Computes the view-dependent part of raw colours. Each row of `features` is evaluated in the
+    /// directions at the row's index in `directions`, which are unit vectors in world space.
     fn view_colours(
         &self,
         features: &[f32],
@@ -94,10 +94,10 @@ impl PointField for Field {
             let outputs = rows.outputs_at(self, &positions, n);
             for (k, &i) in indices.iter().enumerate() {
                 samples.densities[i] = exp(outputs[k].min(MAX_RAW_DENSITY));
-                samples.raw_colours[i] = [0, 1, 2].map(|c| outputs[(RAW_COLOUR + c) * n + k]);
+                samples.raw_colours[i] = [0, 1, 2].map(|c| outputs[(FIRST_RAW_COLOUR + c) * n + k]);
                 for f in 0..VIEW_FEATURES {
                     samples.view_features[VIEW_FEATURES * i + f] =
-                        outputs[(VIEW_FEATURE + f) * n + k];
+                        outputs[(FIRST_VIEW_FEATURE + f) * n + k];
                 }
             }
         }
@@ -132,7 +132,7 @@ impl Field {
         features: &[f32; VIEW_FEATURES],
         directions: &[[f32; 3]],
     ) -> Vec<[f32; 3]> {
-        const { assert!(VIEW_FEATURE + VIEW_FEATURES == DENSITY_OUTPUTS) };
+        const { assert!(FIRST_VIEW_FEATURE + VIEW_FEATURES == DENSITY_OUTPUTS) };
         let n = directions.len().next_multiple_of(LANES);
         let mut input = vec![0.0; VIEW_INPUTS * n];
         for (k, &direction) in directions.iter().enumerate() {

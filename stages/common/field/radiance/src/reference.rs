@@ -17,7 +17,8 @@ use crate::regularisers::{Regularisers, background_likeness};
 use crate::shading::RayGradients;
 use crate::spec::Strides;
 use crate::spec::{
-    BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS,
+    BRICK, DENSITY_OUTPUTS, FEATURES, FIRST_RAW_COLOUR, FIRST_VIEW_FEATURE, HASH_FACTORS,
+    VIEW_INPUTS,
 };
 
 /// Field with f64 parameters, as a reference for the fused passes.
@@ -28,7 +29,7 @@ pub(crate) struct Judge<'a> {
 }
 
 fn colour_of(outputs: &[f64], view_colour: &[f64]) -> [f64; 3] {
-    [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[RAW_COLOUR + c] - view_colour[c]).exp()))
+    [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[FIRST_RAW_COLOUR + c] - view_colour[c]).exp()))
 }
 
 impl Judge<'_> {
@@ -82,7 +83,7 @@ impl Judge<'_> {
 
     /// Returns a ray's view colour from its composited outputs.
     fn view_colour(&self, composited: &[f64], direction: [f32; 3]) -> Vec<f64> {
-        let features = composited[VIEW_FEATURE..].iter().copied();
+        let features = composited[FIRST_VIEW_FEATURE..].iter().copied();
         let input: Vec<f64> =
             features.chain(spherical_harmonics(direction).map(f64::from)).collect();
         assert_eq!((composited.len(), input.len()), (DENSITY_OUTPUTS, VIEW_INPUTS));

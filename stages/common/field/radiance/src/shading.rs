@@ -12,7 +12,9 @@ use crate::mlp::{After, Layer, add_outer, multiply};
 use crate::ray::NormalizedRay;
 use crate::regularisers::{Regularisers, ShadedRay};
 use crate::samples::{Counted, RaySum, Samples};
-use crate::spec::{DENSITY_OUTPUTS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES, VIEW_INPUTS};
+use crate::spec::{
+    DENSITY_OUTPUTS, FIRST_RAW_COLOUR, FIRST_VIEW_FEATURE, VIEW_FEATURES, VIEW_INPUTS,
+};
 use numerics::kernel;
 use numerics::simd::LANES;
 
@@ -111,7 +113,7 @@ kernel! {
                 sum.weight += w;
                 sum.distance = w.mul_add(ray.distance(samples.marched.t[i]), sum.distance);
             }
-            let features = outputs[VIEW_FEATURE..].iter().copied();
+            let features = outputs[FIRST_VIEW_FEATURE..].iter().copied();
             for (row, value) in features.chain(spherical_harmonics(ray.view)).enumerate() {
                 input[row * n + column] = value;
             }
@@ -129,7 +131,7 @@ kernel! {
             for &k in counted.samples_of_ray(r) {
                 let k = k as usize;
                 for c in 0..3 {
-                    colour[c * m + k] = counted.outputs[k][RAW_COLOUR + c] + view_colour[c];
+                    colour[c * m + k] = counted.outputs[k][FIRST_RAW_COLOUR + c] + view_colour[c];
                 }
             }
         }
@@ -222,7 +224,7 @@ kernel! {
             for c in 0..3 {
                 let colour = colour[c * m + k];
                 by_weight = g[c].mul_add(colour, by_weight);
-                gradient[RAW_COLOUR + c] = g[c] * w * colour * (1.0 - colour);
+                gradient[FIRST_RAW_COLOUR + c] = g[c] * w * colour * (1.0 - colour);
             }
             along.by_weight[j] = by_weight;
         }
@@ -324,7 +326,7 @@ impl Shading {
             let len = indices.len();
             let mut composited = [0.0; DENSITY_OUTPUTS];
             for f in 0..VIEW_FEATURES {
-                composited[VIEW_FEATURE + f] = b[f * n + column];
+                composited[FIRST_VIEW_FEATURE + f] = b[f * n + column];
             }
             let ray_gradient = UpstreamGradient { indices, colour: g, composited };
             gradients_along(samples, counted, colour, &ray_gradient, along, gradients);

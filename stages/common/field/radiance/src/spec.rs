@@ -11,11 +11,11 @@ pub const HASH_FACTORS: [u32; 2] = [2_654_435_761, 805_459_861];
 /// Number of outputs of the density network: raw density, raw red, green and blue, view features.
 pub const DENSITY_OUTPUTS: usize = 16;
 /// Index of the first raw colour among the density network's outputs.
-pub const RAW_COLOUR: usize = 1;
+pub const FIRST_RAW_COLOUR: usize = 1;
 /// Index of the first view feature among the density network's outputs.
-pub const VIEW_FEATURE: usize = 4;
+pub const FIRST_VIEW_FEATURE: usize = 4;
 /// Number of view features. Composited along a ray, view features are inputs of the view network.
-pub const VIEW_FEATURES: usize = DENSITY_OUTPUTS - VIEW_FEATURE;
+pub const VIEW_FEATURES: usize = DENSITY_OUTPUTS - FIRST_VIEW_FEATURE;
 /// Number of spherical harmonics of a direction, up to degree 2.
 pub const BASIS: usize = 9;
 /// Number of inputs of the view network: view features and spherical harmonics.
@@ -57,8 +57,8 @@ pub const MIN_HIT_WEIGHT: f32 = 0.03;
 /// Decay rates of Adam's two moments (Müller et al. 2022). The second is below the usual 0.999,
 /// since a grid entry has a gradient in few steps.
 pub const ADAM_BETA: [f64; 2] = [0.9, 0.99];
-/// Numbers of low bits by which Adam's two moments are rounded, so that both of a weight take 32
-/// bits (docs/design/006).
+/// Numbers of low bits that are rounded off Adam's two moments, so that a weight's pair of moments
+/// takes 32 bits (docs/design/006).
 pub const ADAM_ROUNDED_BITS: [u32; 2] = [16, 15];
 /// Term that keeps Adam's denominator above 0 (Müller et al. 2022).
 pub const ADAM_EPSILON: f64 = 1e-15;

@@ -1,7 +1,7 @@
 use radiance::spec::{
-    BASIS, BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, MAX_OPTICAL_DEPTH, MAX_RAW_DENSITY,
-    MIN_HIT_WEIGHT, MIN_TOTAL_WEIGHT, MIN_TRANSMITTANCE, MIN_WEIGHT, OCCUPANCY_CELLS, RAW_COLOUR,
-    TRAINING_ROUND_SAMPLES, VIEW_FEATURE, VIEW_FEATURES,
+    BASIS, BRICK, DENSITY_OUTPUTS, FEATURES, FIRST_RAW_COLOUR, FIRST_VIEW_FEATURE, HASH_FACTORS,
+    MAX_OPTICAL_DEPTH, MAX_RAW_DENSITY, MIN_HIT_WEIGHT, MIN_TOTAL_WEIGHT, MIN_TRANSMITTANCE,
+    MIN_WEIGHT, OCCUPANCY_CELLS, TRAINING_ROUND_SAMPLES, VIEW_FEATURES,
 };
 use radiance::{
     Architecture, CellHit, Field, Occupancy, Pixel, Ray, RayField, RenderError, Strides,
@@ -427,13 +427,13 @@ impl TorchGrid {
         ray: &Tensor,
         rays: i64,
     ) -> Result<Tensor, TchError> {
-        let features = outputs.f_narrow(1, VIEW_FEATURE as i64, VIEW_FEATURES as i64)?;
+        let features = outputs.f_narrow(1, FIRST_VIEW_FEATURE as i64, VIEW_FEATURES as i64)?;
         let features = sum_by_ray(&weight.f_mul(&features)?, ray, rays)?;
         let input = Tensor::f_cat(&[&features, &harmonics(&maps.view)?], -1)?;
         let hidden =
             input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
         let ray_colour = hidden.f_matmul(&self.layers[4])?.f_index_select(0, ray)?;
-        outputs.f_narrow(1, RAW_COLOUR as i64, 3)?.f_add(&ray_colour)?.f_sigmoid()
+        outputs.f_narrow(1, FIRST_RAW_COLOUR as i64, 3)?.f_add(&ray_colour)?.f_sigmoid()
     }
 
     /// Returns the states of the occupancy cells at positions (n × m × 3), as f32: n × m.

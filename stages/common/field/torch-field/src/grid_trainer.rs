@@ -16,8 +16,8 @@ use crate::step::{loss_of_bundles, run_in_pieces};
 
 /// Trains a [`radiance::Field`] like [`radiance::Trainer`], in libtorch: with equal random numbers,
 /// steps, learning rates and occupancy updates, but without [`TrainingOptions::roulette`], so that
-/// all samples get gradients. On the CPU it runs in one thread, and tests compare that trainer with
-/// it; on CUDA it is fast (design note 023).
+/// all samples get gradients. Tests compare the two trainers. On the CPU this one runs in one
+/// thread; on CUDA it is fast (design note 023).
 pub struct GridTrainer {
     grid: TorchGrid,
     options: TrainingOptions,
@@ -457,8 +457,9 @@ mod tests {
         std::iter::once(Device::Cpu).chain(nets::device("cuda").ok()).collect()
     }
 
-    /// Training from scratch begins with double strides everywhere; [`field`] has none. Losses and
-    /// samples equal the hand-written trainer's, for straight and for curved rays.
+    /// Training from scratch begins with double strides everywhere, unlike fine-tuning limited to
+    /// known occupied cells. Losses and samples equal the hand-written trainer's, for straight and
+    /// for curved rays.
     #[test]
     fn begins_with_double_strides_as_the_hand_written_trainer_does() {
         for space in [Space::Box, Space::Contraction] {

@@ -6,7 +6,8 @@ use tch::{Device, Kind, TchError, Tensor};
 use crate::architecture::MlpArchitecture;
 use crate::error::TorchFieldError;
 
-/// One of the two networks: position → density and feature; feature and direction → colour.
+/// Coarse or fine network of a field. The trunk computes density and a feature from a position; the
+/// colour branch computes colour from this feature and a direction.
 #[derive(Debug)]
 pub(crate) struct MlpNetwork {
     architecture: MlpArchitecture,

@@ -4,9 +4,10 @@ use tch::{Kind, TchError, Tensor};
 
 use crate::grid::GridForward;
 
-/// Adds the regularisers' losses to `surrogate`, a scalar whose gradient is that of the step's mean
-/// loss. `forward` has some of the step's rays, `rays` is the number of all; `march_step` is the
-/// length of a step in t.
+/// Adds the regularisers' losses for the rays of `forward` to `surrogate`. The gradient of
+/// `surrogate` is these rays' part of the gradient of the training step's mean loss. `rays` is the
+/// number of rays of the whole training step; `march_step` is the length in t of a step along a
+/// ray.
 pub(crate) fn add_regularisers(
     mut surrogate: Tensor,
     regularisers: &Regularisers,

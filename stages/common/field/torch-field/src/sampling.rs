@@ -44,8 +44,8 @@ pub(crate) fn importance(
     let above = above.f_clamp_max(bins)?;
     let low = cumulative.f_gather(1, &below, false)?;
     let width = cumulative.f_gather(1, &above, false)?.f_sub(&low)?;
-    // In an empty bin the distance grows from the lower edge with slope 1, as in the reference
-    // implementation.
+    // In a nearly empty bin the divisor is 1, as in the reference implementation: distances stay
+    // near the lower edge.
     let width = width.f_where_self(&width.f_ge(1e-5)?, &width.f_ones_like()?)?;
     let first = edges.f_gather(1, &below, false)?;
     let last = edges.f_gather(1, &above, false)?;

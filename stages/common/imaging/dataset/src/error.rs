@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use artifact::{one_line, printable, shortened};
+use artifact::{format_count, one_line, printable, shortened};
 
 use crate::file_status::path_text;
 
@@ -31,5 +31,6 @@ pub(crate) fn frame_label(list: &Path, index: usize, file: &str) -> String {
 pub(crate) fn images_missing(count: usize, folder: Option<&Path>, first: &str) -> anyhow::Error {
     let folder = folder.map(|folder| format!(" in {}", path_text(folder))).unwrap_or_default();
     let first = shortened(first);
-    anyhow::anyhow!("none of the {count} images exists{folder} (first missing: {first})")
+    let images = format_count(count, "image");
+    anyhow::anyhow!("{images} listed, none found{folder} (first missing: {first})")
 }

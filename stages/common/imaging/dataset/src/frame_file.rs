@@ -38,7 +38,7 @@ pub(crate) struct FrameFile {
     pub(crate) split_lists: SplitLists,
 }
 
-/// Frames of a file, and names of files that can't be read.
+/// Frames that were read from a file, their names, and the names of missing and of unused images.
 #[derive(Default)]
 pub(crate) struct ReadFrames {
     pub(crate) frames: Vec<Frame>,

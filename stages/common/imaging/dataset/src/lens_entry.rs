@@ -48,7 +48,7 @@ pub(crate) fn lens_part(entry: &Entry) -> anyhow::Result<Entry> {
 }
 
 /// Returns a frame's lens: its own values, and those of the file's lens for the keys that it lacks.
-/// An own angle of view takes the place of a shared focal length.
+/// The frame's angle of view, if any, replaces the file's focal length along the same axis.
 pub(crate) fn frame_lens(own: &Entry, shared: &Entry) -> Entry {
     let mut lens = shared.clone();
     for (angle, length) in [("camera_angle_x", "fl_x"), ("camera_angle_y", "fl_y")] {

@@ -38,7 +38,7 @@ pub(crate) fn read_matrix(bytes: &[u8]) -> anyhow::Result<Matrix> {
         ">f8" => numbers(data, count, f64::from_be_bytes),
         "<f4" | "=f4" => numbers(data, count, |bytes| f64::from(f32::from_le_bytes(bytes))),
         ">f4" => numbers(data, count, |bytes| f64::from(f32::from_be_bytes(bytes))),
-        _ => bail!("element type is {element_type:?}, not a float"),
+        _ => bail!("element type is {element_type:?}; expected a float of 4 or 8 bytes"),
     };
     let stored = stored.context("file is cut short")?;
     let numbers = if is_by_columns {

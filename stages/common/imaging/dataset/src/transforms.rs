@@ -22,7 +22,7 @@ pub(crate) struct FrameEntry {
     pub(crate) depth_file_path: Option<String>,
     /// Pose, row by row.
     transform_matrix: Value,
-    /// Lens, as far as it differs from the file's.
+    /// Lens values of the frame itself, which override the file's.
     own_lens: Entry,
 }
 
@@ -75,7 +75,7 @@ pub(crate) fn read_frame(
     let (camera_to_world, last) = match rows.as_deref() {
         Some([x, y, z]) => ([*x, *y, *z], None),
         Some([x, y, z, last]) => ([*x, *y, *z], Some(*last)),
-        _ => bail!("transform_matrix must have 4 rows of 4 numbers"),
+        _ => bail!("transform_matrix must have 3 or 4 rows of 4 numbers"),
     };
     let fitted = intrinsics(&frame_lens(&entry.own_lens, lens), read_header(&image)?)?;
     let frame = Frame::new(image, fitted, camera_to_world);
@@ -106,7 +106,8 @@ fn matrix_rows(matrix: &Value) -> Option<Vec<[f64; 4]>> {
     rest.is_empty().then(|| rows.to_vec())
 }
 
-/// Maximum error of a matrix's last row: numbers with four decimals.
+/// Maximum error of a number in a matrix's last row, so that numbers rounded to four decimals are
+/// accepted.
 const MAX_ROW_ERROR: f64 = 1e-4;
 
 /// Fails if a matrix's last row isn't (0, 0, 0, 1).
@@ -134,7 +135,8 @@ fn intrinsics(entry: &Entry, stored: ImageHeader) -> anyhow::Result<(Intrinsics,
     let cx = entry.number("cx")?.unwrap_or(0.5 * f64::from(width));
     let cy = entry.number("cy")?.unwrap_or(0.5 * f64::from(height));
     let (k, turn) = fit_camera(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)?;
-    // Without w and h the camera has the stored shape by assumption, which settles no turn.
+    // Without `w` or `h`, a side of the stored image is assumed, so the fit doesn't tell whether
+    // the image must be turned.
     let is_assumed = turn == Turn::Stored && !(entry.has("w") && entry.has("h"));
     Ok((k, if is_assumed { stored.turn_if_both_fit() } else { turn }))
 }
@@ -376,9 +378,9 @@ mod tests {
                 "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,null]]",
                 "transform_matrix: last row is 0 0 0 NaN, not",
             ),
-            ("[[1,0,0],[0,1,0],[0,0,1]]", "transform_matrix must have 4 rows of 4 numbers"),
-            ("[1,0,0,0,1,0,0,0,1]", "transform_matrix must have 4 rows of 4 numbers"),
-            ("{}", "transform_matrix must have 4 rows of 4 numbers"),
+            ("[[1,0,0],[0,1,0],[0,0,1]]", "transform_matrix must have 3 or 4 rows of 4 numbers"),
+            ("[1,0,0,0,1,0,0,0,1]", "transform_matrix must have 3 or 4 rows of 4 numbers"),
+            ("{}", "transform_matrix must have 3 or 4 rows of 4 numbers"),
         ] {
             let json = frames(r#""fl_x": 50"#, "")
                 .replace(POSE, &format!(r#""transform_matrix": {pose}"#));
@@ -421,7 +423,7 @@ mod tests {
             read(missing)
                 .unwrap_err()
                 .to_string()
-                .contains("none of the 1 images exists (first missing: x.png)")
+                .contains("1 image listed, none found (first missing: x.png)")
         );
     }
 }

@@ -53,11 +53,12 @@ impl AxisTaps {
         self.firsts.len()
     }
 
-    /// Computes the weights P = (s·K·Kᵀ + ρ)⁻¹·K, with s = inputs/outputs and the ridge ρ. For
-    /// ρ = 0, s·Pᵀ is the pseudo-inverse K⁺ along one axis: K⁺·r is the smallest change of the
-    /// inputs that adds r to the outputs. Rows of P sum to nearly 1, as those of K do: a constant r
-    /// changes every input as much by Pᵀ·r as by Kᵀ·r. Detail that K attenuates is amplified.
-    /// Weights farther than `reach` outputs from an input are omitted.
+    /// Computes the weights P = (s·K·Kᵀ + ρ)⁻¹·K. K is the matrix of this resampling's weights,
+    /// with a row for each output; s = inputs/outputs, and ρ is the ridge. For ρ = 0, s·Pᵀ is the
+    /// pseudo-inverse K⁺ along one axis: K⁺·r is the smallest change of the inputs that adds r to
+    /// the outputs. Rows of P sum to nearly 1, as those of K do: a constant r changes every input
+    /// as much by Pᵀ·r as by Kᵀ·r. Detail that K attenuates is amplified. Weights farther than
+    /// `reach` outputs from an input are omitted.
     pub fn inverse(&self, reach: usize) -> Self {
         let (n, scale) = (self.outputs(), self.inputs as f64 / self.outputs() as f64);
         // The Gram matrix is banded: a run overlaps few others.
@@ -240,8 +241,8 @@ mod tests {
         Image::new(width, height, 3, data.collect())
     }
 
-    /// K·(s·Pᵀ) is the identity except for the ridge, for every filter that blurs no more than
-    /// necessary. A flat residual changes all inputs equally.
+    /// K·(s·Pᵀ) is the identity up to the ridge, for every filter. Far from the border, a flat
+    /// residual changes all inputs nearly equally.
     #[test]
     fn inverse_undoes_the_map() {
         for filter in Filter::ALL {

@@ -298,7 +298,7 @@ mod tests {
             .prop_map(|(k1, k2)| Distortion::fisheye([k1, k2, 0.0, 0.0]))
     }
 
-    /// A fisheye camera's rays end 89° from its axis, and points beyond are not projected.
+    /// Rays of a fisheye camera are at most 89° from its axis, and points beyond are not projected.
     #[test]
     fn a_fisheye_covers_89_degrees_from_its_axis() {
         let mut camera = camera(DVec3::Y, 0.4, DVec3::ONE);

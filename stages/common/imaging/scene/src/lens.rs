@@ -246,8 +246,9 @@ impl Distortion {
         let position = self.undistorted_position(distorted);
         let [u, v] = self.distorted_position(position);
         let is_found = (u - distorted[0]).abs().max((v - distorted[1]).abs()) < UNDISTORT_TOLERANCE;
-        // The paths of clamped rays all end at 89°, so samples of different positions don't
-        // complement each other, and each path has more. Both numbers are chosen by hand.
+        // Paths to different border positions usually end at different radii, so that their samples
+        // fill each other's gaps. Clamped rays all end at 89°, so fisheye paths have more samples.
+        // Both numbers are chosen by hand.
         let samples = if self.is_fisheye() { 64u32 } else { 16 };
         (is_found || self.is_fisheye() && is_at_limit(position))
             && (0..=samples).all(|i| {

@@ -12,8 +12,8 @@
 //!   (width/2, height/2). So resizing from W×H to W'×H' multiplies `fx`, `cx` by W'/W and `fy`,
 //!   `cy` by H'/H, without an offset; a half-pixel offset caps PSNR at 25–28 dB at 200 pixels.
 //! * **Distortion** is part of the intrinsics: [`Camera::ray`] and [`Camera::project`] apply it, so
-//!   photographs aren't resampled. A fisheye lens's rays end 89° from the axis, so that depth is
-//!   positive: pixels beyond are masked.
+//!   photographs aren't resampled. Pixels more than 89° from the axis of a fisheye lens are masked,
+//!   so that depth is positive.
 //! * **Rays**: directions have unit length; t is the distance along the ray. **Depth** is
 //!   camera-space z-depth in scene units, -z of the point in camera space, in EXR channel `Z`.
 //! * **Colours**: display-encoded sRGB in [0, 1], as the paper trains and scores.

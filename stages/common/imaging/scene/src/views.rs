@@ -202,7 +202,7 @@ impl Views {
     /// Reads and checks the `views.json` of an input.
     ///
     /// # Errors
-    /// [`Failure::BadInput`] with input, file and view.
+    /// [`Failure::BadInput`] that names the file and, for an invalid name or camera, the view.
     pub fn read(input: &GivenInput) -> Result<Self, Failure> {
         let views: Self = input.read_json(VIEWS_FILE)?;
         views.check().bad_input(input.folder().display())?;
@@ -212,7 +212,7 @@ impl Views {
     /// Reads and checks the `views.json` of a folder.
     ///
     /// # Errors
-    /// [`Failure::BadInput`] with file and view.
+    /// [`Failure::BadInput`] that names the file and, for an invalid name or camera, the view.
     pub fn read_folder(folder: &Path) -> Result<Self, Failure> {
         let path = folder.join(VIEWS_FILE);
         let bytes = std::fs::read(&path).bad_input(path.display())?;

@@ -18,7 +18,7 @@ pub enum Failure {
     /// Numerical failure (NaN, divergence): exit code 4.
     #[error("{0}")]
     Numerical(String),
-    /// Interruption by a signal, which a run resumes from `--work`: exit code 130.
+    /// Interruption by a signal, after which another run can resume from `--work`: exit code 130.
     #[error("interrupted; run again to resume")]
     Interrupted,
 }

@@ -46,7 +46,8 @@ pub struct FileEntry {
 pub enum Damage {
     /// The file is missing.
     #[error(
-        "{path}: not found; the artifact is damaged: `nerf-sr verify --remove`, then run again"
+        "{path}: not found; the artifact is damaged; remove it by `nerf-sr verify --remove`, \
+        then run again"
     )]
     Missing {
         /// Path of the file.
@@ -62,8 +63,8 @@ pub enum Damage {
     },
     /// The size differs.
     #[error(
-        "{path}: {found} bytes, but {expected} in the manifest; the artifact is damaged: \
-        `nerf-sr verify --remove`, then run again"
+        "{path}: {found} bytes, but {expected} in the manifest; the artifact is damaged; \
+        remove it by `nerf-sr verify --remove`, then run again"
     )]
     Size {
         /// Path of the file.
@@ -75,8 +76,8 @@ pub enum Damage {
     },
     /// The content differs.
     #[error(
-        "{path}: the content has changed (blake3 differs); the artifact is damaged: \
-        `nerf-sr verify --remove`, then run again"
+        "{path}: the content has changed (blake3 differs); the artifact is damaged; \
+        remove it by `nerf-sr verify --remove`, then run again"
     )]
     Content {
         /// Path of the file.

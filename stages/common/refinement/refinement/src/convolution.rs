@@ -78,7 +78,8 @@ impl Maps {
         }
     }
 
-    /// Adds maps that are four pixels narrower and lower to the middle of these.
+    /// Adds `other`, which is four pixels smaller in width and in height, to the middle of these
+    /// maps.
     pub(crate) fn add_to_middle(&mut self, other: &Self) {
         for (y, row) in other.data.chunks_exact(other.width * other.depth).enumerate() {
             let start = ((y + 2) * self.width + 2) * self.depth;
@@ -247,8 +248,8 @@ impl LayerGradients {
         kernels
     }
 
-    /// Returns the gradients of a kernel's nine taps for an input and sixteen outputs, whose
-    /// vectors are at `offset` of each point's `size`.
+    /// Returns the gradients of a kernel's nine taps for an input and sixteen outputs. Each point
+    /// has `size` vectors, of which the one at index `offset` is used.
     fn taps(&self, size: usize, offset: usize) -> [Vector; 9] {
         let mut rows = [[Vector::default(); TILE_INPUTS]; 3];
         for point in 0..POINTS {
@@ -725,7 +726,7 @@ fn add_input_gradients<L: Lanes>(products: &BlockRows, tiles: Tiles, dx: &mut Ma
 }
 
 kernel! {
-    /// Convolves `x`; `y` becomes two pixels narrower and lower.
+    /// Convolves `x` into `y`, which becomes two pixels smaller than `x` in width and in height.
     pub(crate) fn convolve<L>(layer: &Convolution, x: &Maps, after: After<'_>, y: &mut Maps,
         scratch: &mut Scratch) {
         y.resize(x.width - 2, x.height - 2, layer.output_vectors);

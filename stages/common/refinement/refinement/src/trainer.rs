@@ -125,9 +125,10 @@ impl RefinerTrainer {
         &self.refiner
     }
 
-    /// Describes the refiner with its scores for validation views, with references drawn from the
-    /// training views, and with the residual weight that gives the smallest squared error.
-    /// `data_consistent` is true if the views are consistent with their own LR photographs.
+    /// Scores the refiner on `examples`, the validation views, with references drawn from
+    /// `references`, the training views. Returns the refiner's description with these scores and
+    /// the residual weight, from 0 to 1, that gives the smallest squared error. `data_consistent`
+    /// is true if the views are consistent with their own LR photographs.
     pub fn score(
         &self,
         examples: &[KnownView],

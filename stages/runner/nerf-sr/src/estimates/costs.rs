@@ -64,10 +64,10 @@ const SCORING: ScoringCosts = ScoringCosts { pixel_seconds: 1.4e-6, pixel_bytes:
 const LPIPS_SCORING: ScoringCosts = ScoringCosts { pixel_seconds: 2.2e-6, pixel_bytes: 580 };
 /// Seconds per photograph's pixel of `prep`.
 const PREPARED_PIXEL_SECONDS: f64 = 30e-9;
-/// Bytes of `prep` without data, and peak memory of each further thread over that of the first:
-/// threads have their peaks at different times (fern and lego, two threads).
+/// Bytes of `prep` without data. Fraction of the first thread's peak memory that each further
+/// thread adds: threads have their peaks at different times (fern and lego, two threads).
 const PREP_BYTES: u64 = 9_000_000;
-const FURTHER_THREAD: f64 = 0.45;
+const FURTHER_THREAD_SHARE: f64 = 0.45;
 /// Seconds per pixel of a training step's patches of `train-refine`, and per pixel of a version of
 /// a view of `refine`: lego and fern.
 const PATCH_PIXEL_SECONDS: f64 = 1.1e-6;
@@ -86,8 +86,8 @@ const WARPED_PATCH_PIXEL_BYTES: u64 = 5_700;
 const REFINED_PIXEL_BYTES: u64 = 128;
 /// Seconds of a start of a stage; chosen by hand.
 const START_SECONDS: f64 = 0.3;
-/// Seconds of `demo-scene` per pixel, for its file, and per ray, without and with a backdrop: the
-/// default scene, a backdrop, and one ray per pixel.
+/// Seconds of `demo-scene`: per pixel, for the image file; per ray, without and with a backdrop.
+/// Derived from the default scene, one with a backdrop, and one with a single ray per pixel.
 const DEMO_PIXEL_SECONDS: f64 = 0.2e-6;
 const DEMO_RAY_SECONDS: f64 = 0.165e-6;
 const BACKDROP_RAY_SECONDS: f64 = 0.32e-6;
@@ -162,7 +162,7 @@ fn demo_scene(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
 
 fn prep_memory(work: &Work) -> u64 {
     let threads = work.images.count.min(work.threads).max(1) as f64;
-    let views = 1.0 + FURTHER_THREAD * (threads - 1.0);
+    let views = 1.0 + FURTHER_THREAD_SHARE * (threads - 1.0);
     PREP_BYTES + (views * work.preparation_bytes as f64) as u64
 }
 
@@ -230,8 +230,8 @@ fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     Some((seconds, torch_program_bytes(work) + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
 }
 
-/// Returns the cost of an export: the time of its rendering, without the factor of the field's
-/// sizes, and the memory as `export` computes it, with a lattice that is a cube.
+/// Returns the cost of an export. The time is that of rendering a field with the default sizes. The
+/// memory is computed as in `export`, for a mesh grid with equally many nodes along all axes.
 fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let scale = match number(parameters, "size") {
         Some(width) => width / work.images.largest_size.0.max(1) as f64,

@@ -43,8 +43,8 @@ impl Policy {
     }
 }
 
-/// Returns all roots of a store, and the IDs of runs that are none. If several roots reach an
-/// entry, the first one gives the reason.
+/// Returns all roots of a store, and the IDs of the runs that aren't roots. If several roots reach
+/// an entry, the first one gives the reason.
 pub(crate) fn find_roots(
     store: &Store,
     contents: &Contents,

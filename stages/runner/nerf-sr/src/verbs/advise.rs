@@ -38,7 +38,7 @@ struct QualityCosts {
     quality: Quality,
     /// Costs by column of [`COLUMNS`].
     parts: [Cost; COLUMNS.len()],
-    /// Cost of all stages of the plan, those of no column, too.
+    /// Cost of all stages of the plan that have an estimate, including those in no column.
     total: Cost,
     /// Memory below which a stage of the plan fails.
     min_memory: u64,
@@ -115,7 +115,9 @@ fn print_table(all: &[QualityCosts], processors: usize) {
         print_line!("{name:<9} {} {total}", parts.join(" "));
     }
     if all.iter().any(|costs| costs.excludes_refining) {
-        print_line!("in all is without refining, which `nerf-sr run {REFINING_TARGET}` adds");
+        print_line!(
+            "column \"in all\" excludes refining, which `nerf-sr run {REFINING_TARGET}` adds"
+        );
     }
     let unknown = all[0].unknown;
     if unknown > 0 {
@@ -149,8 +151,8 @@ fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> &QualityCo
     fastest
 }
 
-/// Returns the costs of the stages that would run with a quality. Prints the scenes with the first
-/// quality.
+/// Returns the costs of the stages that would run with a quality. For the first quality, also
+/// prints the scenes.
 fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Result<QualityCosts> {
     let mut request = request.clone();
     request.parameters.push(format!("quality={}", quality.name()));

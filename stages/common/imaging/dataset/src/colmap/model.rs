@@ -57,7 +57,8 @@ pub(super) fn find_list(folder: &Path, name: &str) -> Result<Option<PathBuf>, Fi
 }
 
 impl Model {
-    /// Reads the model of a folder, binary files before text files. Points are optional.
+    /// Reads the model of a folder: each list from its binary file or, if there is none, from its
+    /// text file. Points are optional.
     pub(super) fn read(folder: &Path) -> anyhow::Result<Self> {
         let mut model = Self::default();
         model.read_cameras(folder)?;

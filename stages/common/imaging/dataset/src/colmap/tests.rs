@@ -243,7 +243,7 @@ fn mistakes_are_named() {
     let forged = read_texts(CAMERAS, &IMAGES.replace("a.png", "\u{1b}[31m.png")).unwrap();
     assert!(forged.notes[1].ends_with(r"(first: \u{1b}[31m.png)"), "{:?}", forged.notes);
     let none = read_texts(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();
-    assert!(none.contains("none of the 2 images exists in "), "{none}");
+    assert!(none.contains("2 images listed, none found in "), "{none}");
     assert!(
         read_texts(CAMERAS, "# nothing\n")
             .unwrap_err()

@@ -123,7 +123,8 @@ impl Rule {
         Some((input, filled(&self.message, parameters)))
     }
 
-    /// Returns whether parameters and inputs satisfy the rule.
+    /// Returns whether the rule doesn't apply, or its `needs` and `must` are satisfied.
+    /// [`Rule::missing_files`] checks `files`.
     pub(crate) fn is_satisfied(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
         !self.applies(parameters, inputs)
             || (self.needs.iter().all(|input| inputs.contains_key(input))

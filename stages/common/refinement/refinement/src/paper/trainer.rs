@@ -14,8 +14,8 @@ use super::perspective::Perspective;
 /// Trains a [`PaperRefiner`] on references and their rendered views. A patch is cut from both after
 /// a warp by one of 200 random perspectives. Its reference patches come from a window of fixed size
 /// around the patch in the unwarped reference. The reported loss is the mean absolute error of
-/// colours in -1..1. As published, 46,875 steps have 32 patches of 64 pixels, each with 8 reference
-/// patches, and the learning rate is 5e-4.
+/// colours in -1..1. As published, each of 46,875 steps has 32 patches of 64×64 pixels, each patch
+/// has 8 reference patches, and the learning rate is 5e-4.
 pub struct PaperTrainer {
     network: PaperRefiner,
     options: TrainingOptions,
