@@ -217,8 +217,8 @@ impl<'a> Estimator<'a> {
     }
 }
 
-/// True for a run of a program that has about the same size, and the same kind of scene: errors of
-/// the models for objects say nothing of opaque scenes.
+/// True for a run of a program that has about the same size, and the same kind of scene: the
+/// models' errors for objects don't predict those for opaque scenes.
 fn is_similar(record: &Record, program: &str, model: ModelCost) -> bool {
     let Some(other) = record.model else { return false };
     let factor = other.processor_seconds / model.processor_seconds;
