@@ -46,7 +46,7 @@ impl GainSums {
     /// Returns the logarithms of the first `views` gains in a channel; their mean is 0.
     fn logarithms(&self, channel: usize, views: usize) -> Vec<f64> {
         let logarithms: Vec<f64> = (self.0.iter().take(views))
-            .map(|sums| ((sums[channel][0] + PRIOR) / (sums[channel][1] + PRIOR)).ln())
+            .map(|sums| libm::log((sums[channel][0] + PRIOR) / (sums[channel][1] + PRIOR)))
             .collect();
         let mean = logarithms.iter().sum::<f64>() / logarithms.len().max(1) as f64;
         logarithms.into_iter().map(|logarithm| logarithm - mean).collect()
@@ -90,7 +90,7 @@ impl Exposures {
         for c in 0..3 {
             let logarithms = self.sums.logarithms(c, self.gains.len());
             for (gains, logarithm) in self.gains.iter_mut().zip(logarithms) {
-                gains[c] = logarithm.exp() as f32;
+                gains[c] = libm::exp(logarithm) as f32;
             }
         }
     }

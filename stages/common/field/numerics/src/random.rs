@@ -41,7 +41,7 @@ impl CounterRng {
         // Never 0, whose logarithm is infinite.
         let u = 1.0 - f64::from(self.uniform());
         let v = f64::from(self.uniform());
-        (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+        (-2.0 * libm::log(u)).sqrt() * libm::cos(std::f64::consts::TAU * v)
     }
 
     /// Draws an integer in 0..bound.

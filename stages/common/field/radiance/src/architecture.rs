@@ -106,7 +106,7 @@ impl GivenSizes {
         // The number of cells at surfaces grows with the square of the resolution. As by default,
         // a finest level of 256 cells has 2^17 entries.
         let (low, high) = LOG2_HASHMAP_RANGE;
-        let by_finest = (17.0 + 2.0 * (finest / 256.0).log2()).round().clamp(low, high) as u32;
+        let by_finest = (17.0 + 2.0 * libm::log2(finest / 256.0)).round().clamp(low, high) as u32;
         let (by_space, exponent) = if is_ndc {
             (MARCH_STEPS_IN_NDC, MARCH_STEPS_EXPONENT_IN_NDC)
         } else {
@@ -115,7 +115,7 @@ impl GivenSizes {
         let steps = self.march_steps.unwrap_or_else(|| {
             // Samples needn't be closer in a coarser field.
             let coarseness = (self.cells_per_pixel / CELLS_PER_PIXEL).min(1.0);
-            (by_space * coarseness.powf(exponent)).round().max(16.0) as u32
+            (by_space * libm::pow(coarseness, exponent)).round().max(16.0) as u32
         });
         let Architecture { base_resolution, mut finest_z, .. } = Architecture::default();
         if is_ndc {

@@ -169,7 +169,7 @@ fn focal_length(
         "{angle} is {}; the angle must be between 0 and π{unit}",
         format_number(value)
     );
-    Ok(Some(0.5 * f64::from(size) / (0.5 * value).tan()))
+    Ok(Some(0.5 * f64::from(size) / libm::tan(0.5 * value)))
 }
 
 #[cfg(test)]

@@ -45,7 +45,7 @@ impl Intrinsics {
     /// Creates the intrinsics of a centred camera with square pixels and a horizontal angle of view
     /// of `angle_x` radians.
     pub fn from_angle_x(width: u32, height: u32, angle_x: f64) -> Self {
-        let focal = 0.5 * f64::from(width) / (0.5 * angle_x).tan();
+        let focal = 0.5 * f64::from(width) / libm::tan(0.5 * angle_x);
         let [cx, cy] = [width, height].map(|side| 0.5 * f64::from(side));
         Self { width, height, fx: focal, fy: focal, cx, cy, distortion: Distortion::default() }
     }

@@ -132,7 +132,7 @@ fn trainable(network: &[(String, Tensor)]) -> Vec<(String, Tensor)> {
 /// 1 to 0.
 pub fn cosine_rate(highest: f64, step: u64, steps: u64, warm_up_steps: u64) -> f64 {
     let warm_up = ((step + 1) as f64 / warm_up_steps as f64).min(1.0);
-    let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
+    let cosine = 0.5 * (1.0 + libm::cos(std::f64::consts::PI * step as f64 / steps as f64));
     highest * warm_up * cosine
 }
 
