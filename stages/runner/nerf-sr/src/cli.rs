@@ -69,7 +69,7 @@ struct PlanArgs {
     /// parameter run once. A value is JSON, such as a number, true or null, or plain text; an empty
     /// value is null, and whole numbers may end in k, M or G. If a parameter is given twice, the
     /// last value wins. `quality` is `best`, `balanced` (default; a third of the time of `best`),
-    /// `fast` (a tenth) or `draft` (a thirtieth). It sets those parameters of training, rendering
+    /// `fast` (a ninth) or `draft` (a thirtieth). It sets those parameters of training, rendering
     /// and refinement that are not set otherwise
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,

@@ -16,7 +16,7 @@ pub use scene_facts::SceneFacts;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Kind of field: the hash grid, or the paper's MLPs, which take hours on a CPU.
+    /// Kind of field: the hash grid, or the paper's MLPs, which are slow on a CPU.
     #[schemars(extend("x-group" = "field"))]
     pub field: FieldParams,
     /// Sub-pixel rays along each side of an LR pixel, called s in the paper; 1 is plain NeRF. The
