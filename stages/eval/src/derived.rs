@@ -11,7 +11,7 @@ use crate::metric::value;
 /// note 034).
 const MAX_NEAR_ANGLE_DEGREES: f64 = 60.0;
 
-/// Returns the smallest gain in PSNR of a view over the same view of another result, in dB. Views
+/// Returns the smallest PSNR gain of any view over the same view of another result, in dB. Views
 /// without HR truth are skipped.
 pub(crate) fn least_gain(
     scored: &[ViewScores],

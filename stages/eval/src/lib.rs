@@ -61,7 +61,7 @@ impl Stage for Eval {
                 Input::optional(
                     &["metrics"],
                     "another method's scores of the same views; the output then has the \
-                    smallest gain of a view in PSNR over these scores",
+                    smallest PSNR gain of any view over these scores",
                 ),
             ),
             (

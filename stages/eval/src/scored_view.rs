@@ -21,9 +21,10 @@ pub(crate) struct ScoredView<'a> {
     pub(crate) render: Image,
     /// HR truth, if any; equal to the render at pixels that don't count.
     pub(crate) truth: Option<Image>,
-    /// Mask of the pixels that count, of the size of the truth's images; `None` for all.
+    /// Mask of the pixels that count, of the size of [`ScoredView::compared_images`]; `None` for
+    /// all.
     pub(crate) mask: Option<Mask>,
-    /// Fraction of the pixels that count by the mask.
+    /// Fraction of the HR pixels that count by the mask; 1 without HR truth.
     pub(crate) counted_share: f64,
     pub(crate) lr: Option<LrPair>,
 }

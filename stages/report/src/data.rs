@@ -18,14 +18,15 @@ use crate::tables::definition;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Maximum number of views with pictures, spread evenly over the test views. A page of many
-    /// results has fewer.
+    /// Maximum number of views with pictures, spread evenly over the test views. A page with many
+    /// results has pictures of fewer views.
     #[schemars(range(min = 1, max = 1000))]
     pub views: u32,
     /// Name of the view that the page displays first.
     #[schemars(extend("x-default" = "the first"))]
     pub compare: Option<String>,
-    /// Square of the view that the page displays first: x, y and side, in pixels.
+    /// Square to which the page zooms at first: x and y of its upper left corner, and its side, in
+    /// pixels of the displayed view.
     #[schemars(extend("x-default" = "the whole view"))]
     pub crop: Option<[u32; 3]>,
 }
@@ -53,7 +54,7 @@ pub(crate) struct Data {
     best: Option<usize>,
     /// Index of the view shown first.
     view: usize,
-    /// Square of that view to show first: x, y and side, in its pixels.
+    /// Square to which the page zooms at first: x, y and side, in pixels of the displayed view.
     crop: Option<[u32; 3]>,
 }
 

@@ -5,11 +5,11 @@
 pub(crate) const WIDTH: f64 = 184.0;
 /// Height of a box in CSS pixels.
 pub(crate) const HEIGHT: f64 = 74.0;
-/// Distance between two boxes of a layer.
+/// Minimum distance between two boxes of a layer.
 const BOX_GAP: f64 = 24.0;
 /// Distance between two layers.
 const LAYER_GAP: f64 = 34.0;
-/// Distance between a lane and a box or another lane.
+/// Minimum distance between a lane and a box or another lane.
 const LANE_GAP: f64 = 16.0;
 /// Number of passes that move items towards their neighbours; chosen by hand.
 const ROUNDS: usize = 12;

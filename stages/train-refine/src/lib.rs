@@ -61,9 +61,10 @@ impl Stage for TrainRefine {
                 "cameras",
                 Input::optional(
                     &cameras,
-                    "cameras of the views to be refined (`net: compact` only); if each camera \
-                    has an LR photograph, the training views are made consistent with their own \
-                    LR photographs, as `refine` will do with the refined views",
+                    "cameras of the views that `refine` will get (`net: compact` only); if each \
+                    camera has an LR photograph in `photographs`, this stage's views are made \
+                    consistent with their own LR photographs, as `refine` will do with its views \
+                    before refinement",
                 ),
             ),
             (

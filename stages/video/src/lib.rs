@@ -25,7 +25,7 @@ pub struct Params {
     /// Frames per second. Default: those of the camera path, otherwise 30.
     #[schemars(range(min = 1, max = 240), extend("x-default" = "by camera path"))]
     pub frames_per_second: Option<u32>,
-    /// Draw depth to the right of colour.
+    /// Draws depth to the right of colour.
     pub show_depth: bool,
 }
 

@@ -4,7 +4,7 @@
 pub(crate) const BRICK_SIDE: usize = 8;
 /// Number of voxels in a brick.
 pub(crate) const VOXELS: usize = BRICK_SIDE * BRICK_SIDE * BRICK_SIDE;
-/// Index at a grid position without brick.
+/// Index at a grid position without a brick.
 const NO_BRICK: u32 = u32::MAX;
 
 /// Returns the position of an entry in a cubic grid of `side`³, x fastest.

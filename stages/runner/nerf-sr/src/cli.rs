@@ -1,8 +1,8 @@
 //! The command line.
 //!
 //! Structs that are flattened into a command, and values of options, have `//` comments. Clap
-//! would take a flattened struct's doc comment as the verb's help. For a doc comment of an option's
-//! value, it would print every verb's help in the long form.
+//! would take a flattened struct's doc comment as the verb's help. If an option's value had a doc
+//! comment, clap would print every verb's help in the long form.
 
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -110,8 +110,10 @@ struct RunOptions {
     /// don't depend on the number [default: processors of this process]
     #[arg(long, value_name = "N", value_parser = positive_count)]
     threads: Option<NonZeroUsize>,
-    /// Memory limit for all stages together, such as 8G. A stage is assumed to need the peak memory
-    /// of its most similar measured run, or none without such a run [default: all memory]
+    /// Memory limit for all stages together, such as 8G. Nothing runs if a stage's estimated
+    /// minimum is larger. A stage starts only if its expected peak fits next to those of running
+    /// stages. The expected peak is that of the stage's most similar measured run, or 0 without
+    /// such a run [default: all memory]
     #[arg(long, value_name = "AMOUNT")]
     memory: Option<Memory>,
     /// Continue with stages that don't depend on a failed one

@@ -2,7 +2,7 @@
 //! atomically. A folder is replaced only if a sink wrote all of it and nobody has changed it
 //! ([`crate::page`]). A page that shows a result which the new one lacks is archived.
 //!
-//! A kill may leave one of these next to a target `NAME`; the next publishing finishes the work:
+//! A kill may leave some of these next to a target `NAME`; the next publishing finishes the work:
 //!
 //! ```text
 //! .NAME.nerf-sr-scrap   a partial copy or a partially deleted folder, without value
@@ -87,9 +87,9 @@ impl Publishing<'_> {
         Ok(archived)
     }
 
-    /// Archives or deletes a page that a killed publishing left: an old page, or a new one that
-    /// never became the target's. The page is archived if it shows a result that the target's page
-    /// lacks.
+    /// Archives or deletes a page that a killed publishing left: the old page, or a new page that
+    /// never replaced it. The page is archived if it is complete, isn't the page being published,
+    /// and shows a result that the target's page lacks.
     fn archive_or_delete_leftover(&self, leftover: &Path) -> io::Result<Option<PathBuf>> {
         let mark = PageMark::read(leftover)?.unwrap_or_default();
         if !has_all_files(leftover) || mark.identity == self.mark.identity {

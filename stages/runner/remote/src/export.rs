@@ -232,7 +232,7 @@ struct CheckedReader<'a> {
     check: ContentCheck<'a>,
     progress: &'a Progress,
     name: &'a str,
-    /// Difference or interruption, which `io::Error` can't represent.
+    /// Difference from the manifest, or interruption; an `io::Error` would hide which of the two.
     problem: Option<anyhow::Error>,
 }
 

@@ -135,15 +135,15 @@ pub struct GridParams {
     /// halves the resulting number of rays, even below `min_rays`.
     #[schemars(range(min = 0.001, max = 100_000.0), extend("x-group" = "sampling"))]
     pub rays_per_pixel: f64,
-    /// Factor of `rays_per_pixel` with `background: opaque`, where each ray hits a surface and
-    /// costs more, most of all while the scene is still hazy.
+    /// Factor of `rays_per_pixel` with `background: opaque`. There each ray hits a surface and
+    /// takes more time, especially early in training, while density is still semi-transparent.
     #[schemars(range(min = 0.01, max = 1.0), extend("x-group" = "sampling"))]
     pub opaque_ray_factor: f64,
-    /// Minimum of the rays that follow from `rays_per_pixel`.
+    /// Minimum number of rays, if the number is derived from `rays_per_pixel`.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
     pub min_rays: u64,
-    /// Maximum of the rays that follow from `rays_per_pixel`, even if `min_rays` is larger. It
-    /// limits the time of a training on many or large photographs.
+    /// Maximum number of rays, if the number is derived from `rays_per_pixel`, even if `min_rays`
+    /// is larger. The maximum limits the time of a training on many or large photographs.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
     pub max_rays: u64,
     /// Target number of samples in the first steps. The last steps have 8/3 times as many. Steps
@@ -157,7 +157,7 @@ pub struct GridParams {
     pub pixel_importance: f64,
     /// Samples along the diagonal of the unit cube. Default: 256 in NDC, where every ray crosses
     /// the whole cube; otherwise 512. Below a `cells_per_pixel` of 2.56, the default falls in
-    /// proportion to `cells_per_pixel` or, in NDC, to its power of 1.5.
+    /// proportion to `cells_per_pixel`, or to `cells_per_pixel`^1.5 in NDC.
     #[schemars(range(min = 16, max = 8192), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub march_steps: Option<u32>,
     /// Weight of the distortion loss, which concentrates the sample weights along a ray. Default:

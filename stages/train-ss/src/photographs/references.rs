@@ -17,7 +17,7 @@ const MIN_OPAQUE_ALPHA: f32 = 1.0 - 1e-4;
 /// stay unchanged. `kernel` made the LR photographs; `log` reports corrections and dropped
 /// references.
 ///
-/// Images with alpha are compared as stored, with premultiplied colours: over a background, the
+/// Images with alpha are compared by their premultiplied colours, not over a background. There, the
 /// kernel's overshoot at the border of an object would look like another exposure, because stored
 /// images are clipped.
 pub(crate) fn check_references(
@@ -71,8 +71,8 @@ fn own_photograph(photographs: &Photographs, camera: &Camera) -> Option<Image> {
     Some(photographs.images[index].unmasked())
 }
 
-/// Returns a reference shrunk by the kernel, and its own LR photograph. Images with alpha are
-/// shrunk from 8 bits to 8 bits, like those of `prep`.
+/// Returns a reference shrunk by the kernel, and its own LR photograph. As in `prep`, images with
+/// alpha are shrunk from 8 bits to 8 bits, except by `average`.
 fn comparable_images(reference: &Image, own: &Image, kernel: Kernel) -> [Image; 2] {
     let is_transparent = is_transparent(reference);
     if is_transparent && kernel != Kernel::Average {
@@ -154,8 +154,8 @@ mod tests {
         Image::new(32, 32, 3, (0..32 * 32 * 3).map(hr_sample).collect())
     }
 
-    /// Checks the changed HR image of camera `name`. Returns the reference, unless it was left out,
-    /// the number of references, and the log.
+    /// Checks the changed HR image of camera `name`. Returns the reference (`None` if it was left
+    /// out), the number of references, and the log.
     fn check_changed(name: &str, change: &dyn Fn(f32) -> f32) -> (Option<Image>, usize, String) {
         let lr = Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr());
         let lr = photographs("a", lr);
@@ -210,7 +210,7 @@ mod tests {
     /// The image is a ball over a transparent background, stored as by `prep` at both sizes.
     /// Lanczos overshoots the ball's colour at its border.
     #[test]
-    fn an_lr_photograph_with_alpha_is_its_own_reference_at_any_size() {
+    fn a_reference_with_alpha_is_kept_unchanged_at_any_size() {
         for size in [32, 48, 64, 100] {
             let hr = pixels::Rgba8::new(
                 size,

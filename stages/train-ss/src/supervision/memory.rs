@@ -58,7 +58,7 @@ pub(crate) fn memory_text(need: &TrainingMemory, budget: u64) -> String {
     let in_memory = need.pixels.min(budget);
     let mut text = format!(
         "memory: about {}, of which {} for the field, {} for pixels, the rest for the program, \
-        cameras and reading",
+        cameras and reading photographs",
         format_size(need.minimum(PROGRAM_BYTES) + in_memory),
         format_size(need.field),
         format_size(in_memory)
@@ -156,7 +156,7 @@ mod tests {
             memory_text(&need, MAX_PIXEL_BYTES),
             format!(
                 "memory: about {total}, of which 300.0 MB for the field, 4.0 GB for pixels, the \
-                rest for the program, cameras and reading; 1.0 GB of pixels in a file"
+                rest for the program, cameras and reading photographs; 1.0 GB of pixels in a file"
             )
         );
         let total = format_size(minimum + 2_000_000);
@@ -164,7 +164,7 @@ mod tests {
             memory_text(&TrainingMemory { pixels: 2_000_000, ..need }, MAX_PIXEL_BYTES),
             format!(
                 "memory: about {total}, of which 300.0 MB for the field, 2.0 MB for pixels, the \
-                rest for the program, cameras and reading"
+                rest for the program, cameras and reading photographs"
             )
         );
     }

@@ -55,7 +55,8 @@ impl LossContext {
         residual.iter().map(|&r| f64::from(self.weight) * f64::from(r) * f64::from(r) / 3.0).sum()
     }
 
-    /// Returns the loss of colours with a sample each, and writes its gradient.
+    /// Returns the mean of the colours' losses, each against its own sample, and writes the mean's
+    /// gradient.
     pub(crate) fn mean_of_losses(
         &self,
         colours: &[[f32; 3]],

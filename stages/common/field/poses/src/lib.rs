@@ -9,11 +9,11 @@
 //! * [`remove_common_motion`]: removes the motion that all cameras share, which photographs can't
 //!   distinguish from a motion of the scene.
 //!
-//! A photograph's gradient is the derivative of each pixel by its position in the image; the
-//! rendered depth gives the derivative of this position by the camera's motion (Lucas and Kanade
-//! 1981; the gradient is that of the template, as in Baker and Matthews 2004). A step renders a few
-//! thousand pixels and needs no derivative of the field, so any field that renders colour and depth
-//! is sufficient.
+//! A photograph's gradient is the derivative of each pixel with respect to its position in the
+//! image; the rendered depth gives the derivative of this position with respect to the camera's
+//! motion (Lucas and Kanade 1981; the gradient is that of the template, as in Baker and Matthews
+//! 2004). A step renders a few thousand pixels and needs no derivative of the field, so any field
+//! that renders colour and depth is sufficient.
 //!
 //! Lengths are in scene units, angles in radians; camera axes are those of `scene` (x right, y up,
 //! looking along -z).
@@ -210,15 +210,15 @@ fn trusted_depth(render: &Pixel, depth_per_distance: f64) -> Option<f64> {
     (render.opacity > MIN_DEPTH_OPACITY && depth.is_finite() && depth > 0.0).then_some(depth)
 }
 
-/// Returns the derivatives of an image position of given depth, to the right and down, by the
-/// camera's rotation about its axes (in radians) and translation along them (in `unit`s).
+/// Returns the derivatives of an image position of given depth, to the right and down, with respect
+/// to the camera's rotation about its axes (in radians) and translation along them (in `unit`s).
 fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [[DVec3; 2]; 2] {
     let k = &camera.intrinsics;
     let [u, v] = k.undistort([u, v]);
     let (x, y) = ((u - k.cx) / k.fx, -(v - k.cy) / k.fy);
     let [by_x, by_y] = k.distortion.jacobian([x, -y]);
     let point = depth * DVec3::new(x, y, -1.0);
-    // Derivatives of the position on the plane of depth 1 by the point in camera space.
+    // Derivatives of the position on the plane of depth 1 with respect to the camera-space point.
     let along_x = DVec3::new(1.0, 0.0, x) / depth;
     let along_y = DVec3::new(0.0, -1.0, -y) / depth;
     let right = k.fx * (by_x[0] * along_x + by_x[1] * along_y);

@@ -258,7 +258,7 @@ impl Samples {
         );
     }
 
-    /// Returns the derivative of a sample's optical depth by its raw density.
+    /// Returns the derivative of a sample's optical depth with respect to its raw density.
     fn optical_depth_slope(&self, sample: usize, raw: f32) -> f32 {
         if raw < MAX_RAW_DENSITY { self.tau[sample] } else { 0.0 }
     }

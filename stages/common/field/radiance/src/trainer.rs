@@ -85,7 +85,7 @@ pub struct Trainer {
     times: [PhaseTimes; Phase::ALL.len()],
 }
 
-/// One element per parameter.
+/// Buffers with one element for each parameter of the grid and of the networks.
 struct ParameterBuffers<T = f32> {
     grid: Aligned<T>,
     network: Aligned<T>,
@@ -370,7 +370,7 @@ impl CellBuffers {
     }
 }
 
-/// Takes the next `len` parameters off a slice, in pieces of one task of the optimiser.
+/// Takes the next `len` parameters off a slice. Returns a piece for each task of the optimiser.
 fn take_pieces<'a, T>(parameters: &mut &'a mut [T], len: usize) -> ChunksMut<'a, T> {
     let (part, rest) = std::mem::take(parameters).split_at_mut(len);
     *parameters = rest;

@@ -17,8 +17,8 @@ pub enum Format {
 }
 
 impl Format {
-    /// All formats in order of recognition: next to `transforms.json` is often the COLMAP model
-    /// from which it was made.
+    /// All formats, in the order in which they are tried. COLMAP comes after `transforms.json`,
+    /// which is often made from a COLMAP model in the same folder.
     pub(crate) const ALL: [Self; 4] = [Self::Blender, Self::Transforms, Self::Llff, Self::Colmap];
 
     /// Returns the format's name with the file that identifies it: `COLMAP (sparse)`.
@@ -46,7 +46,7 @@ impl Format {
         }
     }
 
-    /// True if images that name no mask may have one in the folder `masks`.
+    /// True if an image's mask is looked up by name in the folder `masks`.
     pub(crate) fn has_masks_folder(self) -> bool {
         matches!(self, Self::Llff | Self::Colmap)
     }

@@ -158,8 +158,8 @@ fn find_photographs(folder: &Path, path: &Path, poses: usize) -> anyhow::Result<
     })
 }
 
-/// Lists a folder's images by name, with a remark for an error on files that can't be read. Hidden
-/// files and instant-ngp's masks are not images.
+/// Lists a folder's images by name. Also returns a remark, for an error message, on images that
+/// can't be read or aren't supported. Hidden files and instant-ngp's masks are not images.
 fn list_images(folder: &Path) -> (Vec<PathBuf>, String) {
     let entries = visible_entries(folder);
     let unsupported = unsupported_summary(&entries);

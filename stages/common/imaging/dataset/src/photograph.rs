@@ -310,7 +310,8 @@ impl Frame {
         has_aspect_of(&self.lens_intrinsics, width, height)
     }
 
-    /// Resamples an image of the stored size to the pinhole camera, if distortion is removed.
+    /// Resamples an image of the size of `lens_intrinsics` to the pinhole camera, if distortion is
+    /// removed.
     fn without_distortion(&self, image: Rgba8) -> Rgba8 {
         match &self.pinhole {
             Some(pinhole) => undistort_image(&image, &self.lens_intrinsics, pinhole),

@@ -234,8 +234,8 @@ pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
     Ok(read_windows(path)?.size)
 }
 
-/// Returns the peak memory of [`read_exr`] in bytes, estimated from the header: each sample of the
-/// data window as stored, and each of the display window as f32.
+/// Returns the peak memory of [`read_exr`] in bytes, estimated from the header: 4 bytes for each
+/// sample of the data window, and 4 for each sample of the display window.
 pub fn exr_reading_bytes(path: &Path) -> Result<u64, PixelError> {
     let layers = read_header(path)?.headers;
     let samples = layers.iter().map(|h| {
@@ -259,7 +259,7 @@ fn read_windows(path: &Path) -> Result<Windows, PixelError> {
     let meta = read_header(path)?;
     let first = meta.headers.first().ok_or_else(|| PixelError::format(path, "no layer"))?;
     let (data, image) = (first.data_window(), first.shared_attributes.display_window);
-    // Positions may be as far apart as an i32 allows.
+    // The difference of two positions may exceed an i32.
     let start = |from: i32, origin: i32, length: usize, limit: usize| {
         let start = usize::try_from(i64::from(from) - i64::from(origin)).ok()?;
         (start.checked_add(length)? <= limit).then_some(start)

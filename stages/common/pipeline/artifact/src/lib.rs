@@ -8,8 +8,8 @@
 //! * [`Failure`]: an error, classified by the user's next step; each kind has its exit code.
 //! * [`print_line!`], [`report_line!`], [`printable`], [`format_count`]: text of messages.
 //!
-//! Descriptions and the command line of stages are in `stage`, which libraries that stages share
-//! don't need.
+//! Stages' descriptions and command line are in `stage`; the libraries that stages share don't
+//! need it.
 //!
 //! ```
 //! use artifact::{MANIFEST_FILE, Manifest, write_json};

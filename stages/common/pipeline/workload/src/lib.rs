@@ -32,7 +32,7 @@ const MAX_SCALE: f64 = 2.0;
 const BYTES_PER_NODE: u64 = size_of::<f32>() as u64;
 /// Bytes of a rendered pixel.
 pub const SURFACE_PIXEL_BYTES: u64 = 24;
-/// Bytes of a sample that is merged to a surfel.
+/// Bytes of a sample that is merged into a surfel.
 pub const SURFEL_SAMPLE_BYTES: u64 = 20;
 
 /// Returns the size of the views that `export` renders without a given width, relative to cameras

@@ -4,7 +4,7 @@ use serde::Deserialize;
 /// (`experiments/common.yaml`).
 const FINE_TUNING_RAY_FACTOR: f64 = 0.5;
 
-/// Parameters from which the rays of a training follow. Deserialised from the parameters of
+/// Parameters that determine the number of a training's rays. Deserialised from the parameters of
 /// `train-ss`.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct RayBudget {

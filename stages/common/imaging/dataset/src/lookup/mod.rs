@@ -1,12 +1,19 @@
 //! Finds the files that a data set names inside its folder, even if the folder was written on
 //! another machine, or its files were moved, renamed, converted or reduced (docs/design/005).
 //!
-//! A name is tried literally; with `\` read as `/`; as the longest tail of an absolute path, or of
-//! any path if no name is found otherwise, with the same number of leading parts removed from all
-//! names; with a missing or doubled extension; in a different Unicode normal form (NFC, or NFD as
-//! on macOS); and in a different case. Steps combine, each logs one line per data set
-//! ([`Lookup::notes`]), and two candidates are an error. Paths out of the folder are never opened;
-//! links inside it are followed.
+//! A name is tried:
+//!
+//! * literally;
+//! * with `\` read as `/`;
+//! * without its leading parts, the same number for all names. Only absolute paths lose parts, or
+//!   all paths if no name is found otherwise;
+//! * in a reduced copy `images_N`, if `images` is missing or empty;
+//! * with a missing, doubled or converted extension;
+//! * in a different Unicode normal form (NFC, or NFD as on macOS);
+//! * in a different case.
+//!
+//! Steps combine, each logs one line per data set ([`Lookup::notes`]), and two candidates are an
+//! error. Paths out of the folder are never opened; links inside it are followed.
 
 mod listings;
 mod matching;
@@ -79,7 +86,7 @@ enum ClaimedFiles {
     Included,
 }
 
-/// Function that splits names that may lose leading folders; `None` for other names.
+/// Function that splits a name whose leading parts may be removed; `None` for other names.
 type SplitName = fn(&str) -> Option<Vec<&str>>;
 
 /// Interpretation of a name as a path.
@@ -101,7 +108,7 @@ pub(crate) struct Lookup {
     listings: Listings,
     /// Folder that names are relative to, inside the data set's folder.
     base: PathBuf,
-    /// Function that splits the names that lose leading parts.
+    /// Function that splits names whose leading parts may be removed.
     split_name: SplitName,
     /// Number of leading parts that such names lose; `None` if no tail is a file.
     removed: Option<usize>,
@@ -171,7 +178,8 @@ impl Lookup {
         self.root().join(&self.base)
     }
 
-    /// Returns a path of the data set relative to the folder of photographs.
+    /// Returns a path of the data set relative to the folder that names are relative to, or to its
+    /// reduced copy.
     pub(crate) fn without_base(&self, path: &Path) -> PathBuf {
         let images = self.substitute.as_deref().unwrap_or(IMAGES);
         let inside = path.strip_prefix(&self.base).or_else(|_| path.strip_prefix(images));
@@ -188,7 +196,8 @@ impl Lookup {
         self.locate(name, ClaimedFiles::Excluded)
     }
 
-    /// Finds the file of a name in a list that repeats names, which another name may have claimed.
+    /// Finds the file of a name that a list repeats. Unlike [`Self::find`], also finds claimed
+    /// files by tolerance.
     pub(crate) fn find_repeated(&mut self, name: &str) -> Result<LocatedFile, LookupError> {
         self.locate(name, ClaimedFiles::Included)
     }
@@ -221,8 +230,8 @@ impl Lookup {
         }
     }
 
-    /// Finds the image in an unsupported format that a name without extension means: the error that
-    /// follows names the command that converts the image.
+    /// Finds the image in an unsupported format that a name without extension means. Reading that
+    /// image fails with an error that names the command to convert it.
     fn unsupported_file(&mut self, name: &str) -> Option<PathBuf> {
         let path = self.base.join(relative_path(name).ok()?);
         let stem = path.file_name().filter(|_| !has_image_extension(&path))?;
