@@ -9,11 +9,11 @@
 //! * [`remove_common_motion`]: removes the motion that all cameras share, which photographs can't
 //!   distinguish from a motion of the scene.
 //!
-//! A photograph's gradient is the derivative of each pixel by its position in the image; the
-//! rendered depth gives the derivative of this position by the camera's motion (Lucas and Kanade
-//! 1981; the gradient is that of the template, as in Baker and Matthews 2004). A step renders a few
-//! thousand pixels and needs no derivative of the field, so any field that renders colour and depth
-//! is sufficient.
+//! A photograph's gradient is the derivative of each pixel with respect to its position in the
+//! image; the rendered depth gives the derivative of this position with respect to the camera's
+//! motion (Lucas and Kanade 1981; the gradient is that of the template, as in Baker and Matthews
+//! 2004). A step renders a few thousand pixels and needs no derivative of the field, so any field
+//! that renders colour and depth is sufficient.
 //!
 //! Lengths are in scene units, angles in radians; camera axes are those of `scene` (x right, y up,
 //! looking along -z).

@@ -125,8 +125,8 @@ pub(crate) fn contracted_position(
     u.map(|x| (0.25 * factor).mul_add(x, 0.5))
 }
 
-/// Returns the derivative of [`contracted_position`] by t. Both the inside and the outside of the
-/// ball are computed, so that a loop vectorises.
+/// Returns the derivative of [`contracted_position`] with respect to t. Both the inside and the
+/// outside of the ball are computed, so that a loop vectorises.
 #[inline(always)]
 pub(crate) fn contracted_velocity(
     origin: [f32; 3],

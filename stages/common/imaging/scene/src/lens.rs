@@ -224,7 +224,7 @@ impl Distortion {
         (angle * radial, radial + 2.0 * square * derivative)
     }
 
-    /// Returns r and its derivative by ρ.
+    /// Returns r and its derivative with respect to ρ.
     fn radial_factor(&self, square: f64) -> (f64, f64) {
         let [k1, k2, k3, k4] = self.radial;
         let numerator = 1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4)));
