@@ -10,13 +10,13 @@ use serde_json::Value;
 /// Name of the file in the input `path` and in the artifact.
 pub(crate) const PATH_FILE: &str = "camera_path.json";
 
-/// Frames per second of computed paths, as in films by default.
+/// Frames per second of computed paths; also the default of stage `video`.
 const FRAMES_PER_SECOND: f64 = 30.0;
 
 /// Frames per second of recorded paths that don't state them, as in nerfstudio's viewer.
 const RECORDED_FRAMES_PER_SECOND: f64 = 24.0;
 
-/// Maximum width and height of frames, as of the parameter `size`.
+/// Maximum width and height of frames; also the maximum of the parameter `size`.
 pub(crate) const MAX_SIDE: u32 = 65536;
 
 /// Content of `camera_path.json`. Fields that don't determine the images, such as `crop`, are
@@ -37,7 +37,8 @@ pub(crate) struct PathFile {
     /// Duration, from the number of frames and `fps`.
     #[serde(skip_deserializing)]
     seconds: f64,
-    /// True if the last frame precedes the first. nerfstudio's add-on for Blender writes a string.
+    /// True if the path is a loop: the first frame follows the last. nerfstudio's add-on for
+    /// Blender writes a string.
     #[serde(default)]
     is_cycle: Value,
     #[serde(default)]
@@ -63,7 +64,7 @@ struct PathFrame {
     camera_to_world: [f64; 16],
     /// Vertical angle of view in degrees.
     fov: f64,
-    /// Width over height; nerfstudio takes them from the size.
+    /// Width over height; nerfstudio uses `render_width` and `render_height` instead.
     #[serde(default)]
     aspect: f64,
 }
@@ -98,8 +99,8 @@ fn write_rate<S: Serializer>(rate: &f64, serializer: S) -> Result<S::Ok, S::Erro
 
 impl PathFile {
     /// Creates a path whose frames have the size and focal length of a camera. Every frame is a
-    /// key. Pixels of frames are square and their principal point is in the middle: the format has
-    /// one angle of view. It isn't wider than the camera's.
+    /// key. Frames have square pixels and the principal point in the middle, since the format has
+    /// only one angle of view. This angle isn't wider than the camera's.
     pub(crate) fn new(camera: &Intrinsics, poses: &[Pose], is_cycle: bool) -> Self {
         let height = f64::from(camera.height);
         let fov = 2.0 * (0.5 * height / camera.fx.max(camera.fy)).atan().to_degrees();

@@ -12,7 +12,7 @@ const EXPOSURE_STREAM: u64 = 401;
 /// RNG stream of pose errors.
 const POSE_STREAM: u64 = 402;
 
-/// Makes the colours of training view `i` brighter or darker, display-encoded.
+/// Multiplies the display-encoded colours of training view `i` by a random gain.
 pub(crate) fn expose(image: &mut Rgba8, params: &Params, i: u32) {
     if params.exposure_difference == 0.0 {
         return;

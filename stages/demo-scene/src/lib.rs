@@ -197,10 +197,9 @@ mod tests {
         assert!(hits > 100, "{hits} rays hit a surface");
     }
 
+    /// The border of every test view is transparent, so no object is cut off.
     #[test]
-    fn the_scene_stays_in_every_view() {
-        // Surfaces in test views must be inside the training views' frusta, or near/far and hull
-        // would be guesses.
+    fn test_views_show_the_whole_scene() {
         let world = World::new(0);
         for aspect in [1.0, 1.5, 0.75] {
             let camera = test_camera(48, aspect);

@@ -32,7 +32,7 @@ pub(crate) struct Reflectance {
 }
 
 /// Hashes a lattice cell to [0, 1). In two dimensions, `z` numbers a pattern or a face. The
-/// multipliers are 2⁶⁴ over the golden ratio, two primes of xxHash and that of degski64.
+/// multipliers are 2⁶⁴ over the golden ratio, two primes of xxHash, and degski64's multiplier.
 fn hash(x: i64, y: i64, z: i64, seed: u32) -> f64 {
     let mut h = (x as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
         ^ (y as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F)
@@ -109,7 +109,7 @@ fn printed_crate(p: DVec3, normal: DVec3, seed: u32) -> DVec3 {
     } else {
         (p.x, p.y)
     };
-    // Number of the face: -2, 0 or 1 by each coordinate of its normal.
+    // Number of the face, with a digit of -2, 0 or 1 for each coordinate of the normal.
     let face = cell(normal.x * 1.5) * 9 + cell(normal.y * 1.5) * 3 + cell(normal.z * 1.5);
     if u.abs().max(v.abs()) > 0.88 {
         return DVec3::new(0.45, 0.30, 0.10);

@@ -15,7 +15,8 @@ const MIN_TOTAL_WEIGHT: f32 = 1e-3;
 /// Returns the colours of a mesh's vertices, display-encoded sRGB: the mean over the views that
 /// observe the vertex, weighted by the squared cosine between the vertex normal and the direction
 /// to the camera. Other vertices, and those seen only at grazing angles, get the colour that the
-/// field renders against the normal. `offset` is the origin of the mesh's frame, in the world.
+/// field renders for a ray opposite to the normal. `offset` is the origin of the mesh's frame, in
+/// the world.
 pub(crate) fn vertex_colours(
     field: &FieldArtifact,
     views: &[SurfaceView],

@@ -32,9 +32,9 @@ pub struct Params {
     /// Width of the views; heights follow the cameras' aspect ratio. Default: the cameras' size.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by camera"))]
     pub size: Option<u32>,
-    /// Rays along each side of a pixel. 1 casts one through its centre; 2 casts four further ones,
-    /// and the pixel gets half of their mean colour, half of the centre's, and the depth of one of
-    /// the four.
+    /// Rays along each side of a pixel. 1 casts one ray through the pixel's centre; a larger n
+    /// casts n × n further rays. The colour is then the mean of the centre's colour and the further
+    /// rays' mean. The depth is that of one further ray.
     #[schemars(range(min = 1, max = 8))]
     pub samples_per_axis: u32,
     /// Maximum error of colour or opacity of a pixel with one ray; pixels with a larger error get

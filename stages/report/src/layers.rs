@@ -120,7 +120,8 @@ impl Layer<'_> {
         }
     }
 
-    /// Draws the picture of a view, if available; `range` is that of the depths' colours.
+    /// Draws the picture of a view, if available; `range` has the depths that the colour scale
+    /// covers.
     pub(crate) fn picture(&self, view: &str, range: (f32, f32)) -> anyhow::Result<Option<Rgba8>> {
         match &self.source {
             Source::Views(folder) => {

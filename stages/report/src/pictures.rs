@@ -40,7 +40,7 @@ pub(crate) struct Request<'a> {
     pub(crate) name: &'a str,
     /// Index of the layer.
     pub(crate) layer: usize,
-    /// Range of the colours of depths.
+    /// Range of depths that the colour scale covers.
     pub(crate) depths: (f32, f32),
 }
 
@@ -87,7 +87,8 @@ const QUALITIES: [Quality; 11] = [
 /// Number of pictures from which the size of all copies is predicted (docs/design/041).
 const SAMPLE_COUNT: usize = 16;
 
-/// Writes originals to `views/` and returns copies of at most `budget` bytes in total.
+/// Writes originals to `views/` and returns copies of at most `budget` bytes in total. If no
+/// quality fits, the copies have the lowest one.
 pub(crate) fn write_pictures(
     context: &Context,
     layers: &[Layer<'_>],
@@ -220,7 +221,8 @@ fn encode_jpeg(image: &Rgba8, quality: u8, group: &Group) -> anyhow::Result<Vec<
     Ok(bytes)
 }
 
-/// Returns unique file names of the originals: one folder per view, with plain letters only.
+/// Returns unique paths of the originals: one folder per view, with only the characters that
+/// [`plain`] keeps.
 fn file_names(layers: &[Layer<'_>], requests: &[Request<'_>]) -> Vec<String> {
     let mut taken = BTreeSet::new();
     let mut names = Vec::with_capacity(requests.len());
@@ -239,16 +241,19 @@ fn file_names(layers: &[Layer<'_>], requests: &[Request<'_>]) -> Vec<String> {
 
 /// Returns the path of a view's original without extension, which needn't be unique.
 fn stem(layer: &Layer<'_>, view: &str) -> String {
-    let is_plain = match layer.group {
+    let is_unlabelled = match layer.group {
         Group::Render => layer.label == ONLY_RENDER,
         _ => layer.rows.is_empty(),
     };
-    let suffix =
-        if is_plain { String::new() } else { format!("-{}", plain(&layer.label.to_lowercase())) };
+    let suffix = if is_unlabelled {
+        String::new()
+    } else {
+        format!("-{}", plain(&layer.label.to_lowercase()))
+    };
     format!("views/{}/{}{suffix}", plain(view), plain(layer.group.file_name()))
 }
 
-/// Replaces characters that aren't plain in paths and URLs, and keeps at most 60.
+/// Replaces all characters except ASCII letters, digits, `-`, `_` and `.`, and keeps at most 60.
 fn plain(text: &str) -> String {
     let text: String = text
         .chars()

@@ -126,7 +126,7 @@ impl Stage for TrainSs {
         let comparison_rays = if params.pose_refinement { params.member(0).rays } else { 0 };
         let total_rays = comparison_rays + params.rays;
         let progress = context.progress("training", total_rays);
-        let cells = params.silhouettes.then(|| silhouettes::cells_within(input, &views));
+        let cells = params.silhouettes.then(|| silhouettes::cells_in_visual_hull(input, &views));
         let cells = cells.transpose()?.flatten();
         if let Some(cells) = &cells {
             let empty = cells.iter().filter(|is_allowed| !**is_allowed).count();

@@ -1,4 +1,4 @@
-//! Visual hull of photographs with alpha: cells that some photograph shows empty.
+//! Visual hull from photographs with alpha: the cells that no photograph shows to be empty.
 
 use artifact::GivenInput;
 use glam::DVec3;
@@ -15,22 +15,26 @@ const MARGIN_PIXELS: f64 = 1.5;
 /// Highest alpha of a transparent pixel: half a step of 8 bits.
 const MAX_TRANSPARENT_ALPHA: f32 = 0.5 / 255.0;
 
-/// Returns a mask of the occupancy cells without those that some view sees only through transparent
-/// pixels. Returns `None` if no photograph has alpha, or if the space isn't a box.
-pub(crate) fn cells_within(input: &GivenInput, views: &Views) -> anyhow::Result<Option<Vec<bool>>> {
+/// Returns a mask of the occupancy cells: false for each cell that lies entirely behind transparent
+/// pixels in at least one view. Returns `None` if the space isn't a box, or if no photograph has
+/// both transparent and opaque pixels.
+pub(crate) fn cells_in_visual_hull(
+    input: &GivenInput,
+    views: &Views,
+) -> anyhow::Result<Option<Vec<bool>>> {
     // Opaque photographs have no alpha, and reading them takes time.
     if views.bounds.space != Space::Box || views.background == Background::Opaque {
         return Ok(None);
     }
     let mut cells = vec![true; OCCUPANCY_CELLS.pow(3)];
-    let mut has_alpha = false;
+    let mut has_silhouette = false;
     for view in &views.views {
         if let Some(silhouette) = Silhouette::new(&read_photograph(input, view)?) {
-            has_alpha = true;
+            has_silhouette = true;
             silhouette.carve(&view.camera, &views.bounds, &mut cells);
         }
     }
-    Ok(has_alpha.then_some(cells))
+    Ok(has_silhouette.then_some(cells))
 }
 
 /// Number of opaque pixels above and to the left of each pixel corner of a photograph. A pixel of

@@ -10,8 +10,8 @@ pub(crate) const COEFFICIENTS: usize = 3 * BASIS;
 /// Ridge penalty per direction: coefficients that no direction determines are 0. Chosen by hand.
 const RIDGE: f64 = 0.001;
 
-/// Fits coefficients, channel by channel, to colours less their mean, by ridge regression. Returns
-/// the mean and the coefficients.
+/// Fits coefficients, channel by channel, to the differences of colours from their mean, by ridge
+/// regression. Returns the mean and the coefficients.
 pub(crate) fn fit(
     directions: &[[f32; 3]],
     colours: &[[f32; 3]],
@@ -48,7 +48,8 @@ struct Component {
     scale: f32,
 }
 
-/// Root mean squares in a component's scale; few values are beyond. Chosen by hand.
+/// Ratio of a component's scale to the root mean square of the component's values. Few values are
+/// beyond the scale. Chosen by hand.
 const SCALE_RMS: f64 = 4.0;
 
 impl Components {
@@ -87,8 +88,8 @@ impl Components {
         Self(components)
     }
 
-    /// Returns red, green and blue of each axis's spherical harmonics times its scale, in the
-    /// shader's order.
+    /// Returns the product of each component's axis and scale, in the shader's order: red, green
+    /// and blue of each spherical harmonic in turn.
     pub(crate) fn for_shader(&self) -> Vec<f32> {
         let mut numbers = Vec::with_capacity(self.0.len() * COEFFICIENTS);
         for Component { axis, scale } in &self.0 {

@@ -71,14 +71,14 @@ fn place_cases() -> Vec<Case> {
             "3D Gaussian Splatting's distorted/sparse/0",
             |folder| write_colmap_set(folder, "distorted/sparse/0", "input"),
             Expected::Refused(
-                "dataset: DIR: no data set; found a COLMAP model in distorted/sparse/0 and images in input; rename these folders sparse/0 and images",
+                "dataset: DIR: no data set; found a COLMAP model in distorted/sparse/0 and images in input; rename these folders to sparse/0 and images",
             ),
         ),
         case(
             "images in another folder",
             |folder| write_colmap_set(folder, "sparse/0", "photos"),
             Expected::Refused(
-                "dataset: DIR/sparse/0/images.txt: 3 images listed, none found in DIR (first missing: a0.png); the image is in photos: rename this folder images",
+                "dataset: DIR/sparse/0/images.txt: 3 images listed, none found in DIR (first missing: a0.png); the image is in photos: rename this folder to images",
             ),
         ),
         case(

@@ -1,8 +1,9 @@
 //! Values on the command line: `-p NAME=VALUE[,VALUE…]` (docs/design/030, S3.6).
 //!
-//! A JSON number, `true`, `false` or `null` is parsed as JSON. An empty value is `null`. A value
-//! that starts with `[`, `{` or `"` is JSON and may contain commas. Any other value is a string,
-//! including `0x10`, `+2`, `02` and ` 2`, which numeric parameters therefore refuse.
+//! A JSON number, `true`, `false` or `null` is parsed as JSON. An empty text is `null`, but an
+//! empty value in a list is refused. A value that starts with `[`, `{` or `"` is JSON and may
+//! contain commas. Any other value is a string, including `0x10`, `+2`, `02` and ` 2`, which
+//! numeric parameters therefore refuse.
 
 use serde_json::Value;
 

@@ -76,8 +76,9 @@ impl Store {
         }
     }
 
-    /// Marks the store with this program's format. The store is closed while it is marked: every
-    /// other process has left the store before, or reads the mark on entering.
+    /// Marks the store with this program's format, except on a read-only file system. Waits for the
+    /// store's exclusive lock, so no other process has a lock of the store meanwhile. Each process
+    /// that acquires one later checks the mark.
     fn mark_format(&self) -> Result<(), StoreError> {
         let gate = match self.open_gate() {
             Err(StoreError::Io { source, .. })
@@ -169,9 +170,9 @@ mod tests {
         locks.lines().filter(|line| line.contains("->") && line.contains(&file)).count()
     }
 
-    /// A newer program waits until others have left the store. Of several, the newest wins.
+    /// A newer program waits until others have released the store. Of several, the newest wins.
     #[test]
-    fn a_newer_program_waits_until_the_store_is_left() {
+    fn a_newer_program_waits_until_others_release_the_store() {
         let dir = tempfile::tempdir().unwrap();
         let older = Store::open_as(dir.path(), 1).unwrap();
         let inside = entered(&older);

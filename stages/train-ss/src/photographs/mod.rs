@@ -66,7 +66,7 @@ impl Photographs {
 
 #[cfg(test)]
 impl Photographs {
-    /// Returns the only photograph of a camera, RGB or premultiplied RGBA.
+    /// Creates a set of one photograph and its camera; `image` is RGB or premultiplied RGBA.
     pub(crate) fn taken_by(camera: scene::Camera, image: pixels::Image) -> Self {
         let views = Views::new(
             Background::White,

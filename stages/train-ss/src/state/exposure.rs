@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 const DECAY: f64 = 0.998;
 /// Weight of the prior that gains are 1, in white pixels; chosen by hand.
 const PRIOR: f64 = 1.0;
-/// Training progress before which all gains are 1, because the field is still too rough. Much later
-/// the field has already explained exposures by floaters: from 0.1, gains are half of the true
-/// ones; from 0.3, they stay 1 (design note 026).
+/// Training progress before which all gains are 1, because the field is still too rough. With a
+/// much larger value, the field would already have explained exposures by floaters (design note
+/// 026): about half of each difference would be found at 0.1, and none at 0.3.
 const FIRST_PROGRESS: f64 = 0.02;
-/// Steps in which the gains of a training that applies none are measured, each range with the
-/// minimum clear difference relative to the field's error. Differences between equal exposures come
-/// from this error: up to 0.134 in eight scenes (design note 026).
+/// Ranges of steps in which gains are measured but not applied, each with a factor. Exposures count
+/// as different if their spread is at least this factor times the field's relative error. Equal
+/// exposures have a spread of up to 0.134 times this error in eight scenes (design note 026).
 const MEASUREMENTS: [(Range<u64>, f64); 4] =
     [(128..192, 0.2), (192..256, 0.2), (256..384, 0.2), (384..512, 0.2)];
 /// Additional measurement in a contraction, where the field explains large differences within 70
@@ -149,7 +149,8 @@ impl ExposureMeasurement {
     }
 
     /// Returns the difference between the first `views` photographs after a step that ends a
-    /// measurement, at a training progress in 0..1; `None` after any other step.
+    /// measurement, at a training progress in 0..1; `None` after any other step, or beyond
+    /// [`MAX_MEASURED_PROGRESS`].
     pub(crate) fn difference(&self, progress: f64, views: usize) -> Option<ExposureDifference> {
         let ended = self.measurements.iter().find(|(steps, _)| steps.end == self.steps);
         let (_, factor) = ended.filter(|_| progress <= MAX_MEASURED_PROGRESS)?;
@@ -169,11 +170,11 @@ impl ExposureMeasurement {
 /// Result of a measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ExposureDifference {
-    /// Number of steps until then.
+    /// Number of steps until the end of the measurement.
     steps: u64,
     /// Root mean square of the logarithms of the photographs' gains.
     spread: f64,
-    /// Minimum of `spread` that is clear.
+    /// Minimum `spread` at which the exposures count as different.
     limit: f64,
 }
 
@@ -194,9 +195,9 @@ impl fmt::Display for ExposureDifference {
         let Self { steps, spread, limit } = self;
         let [spread, limit] = [spread, limit].map(|of| 100.0 * of);
         let (order, decision) = if self.is_clear() {
-            ("at least", "starting over with exposures")
+            ("at least", "starting over and estimating exposures")
         } else {
-            ("less than", "continuing without exposures")
+            ("less than", "continuing without estimating exposures")
         };
         write!(
             f,

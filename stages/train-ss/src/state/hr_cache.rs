@@ -82,8 +82,8 @@ impl HrCache {
         Self { supersample, views: Vec::new() }
     }
 
-    /// False if the filter's footprint is exactly the block of an LR pixel: then residuals depend
-    /// on freshly rendered pixels alone, and equal those of the mean.
+    /// Returns false if the filter's footprint is exactly the block of an LR pixel. Residuals then
+    /// depend only on freshly rendered pixels, and equal the residuals of these pixels' mean.
     pub(crate) fn is_needed(filter: Filter, hr: (usize, usize), lr: (usize, usize)) -> bool {
         let is_whole = hr.0.is_multiple_of(lr.0) && hr.1.is_multiple_of(lr.1);
         !(filter == Filter::Box && is_whole)
@@ -125,9 +125,9 @@ impl HrCache {
 
     /// Computes the kernel's residuals around an LR pixel, with freshly rendered `colours` in the
     /// pixel's block and cached ones elsewhere, and back-projects them to the block: writes
-    /// Pᵀ·residual, with the P of [`Resampling::inverse`]. But for its ridge and reach, Pᵀ is
-    /// K⁺ / s², with the pseudo-inverse K⁺ = Kᵀ·(K·Kᵀ)⁻¹. Returns the residual of the pixel itself.
-    /// `residual_of` returns the residual for a channel, a prediction and its target.
+    /// Pᵀ·residual, with the P of [`Resampling::inverse`]. Apart from the ridge and the limited
+    /// reach, Pᵀ is K⁺ / s², with the pseudo-inverse K⁺ = Kᵀ·(K·Kᵀ)⁻¹. Returns the residual of the
+    /// pixel itself. `residual_of` returns the residual for a channel, a prediction and its target.
     pub(crate) fn back_project(
         &self,
         pixel: LrPixel,
@@ -332,8 +332,8 @@ mod tests {
         }
     }
 
-    /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole images, at any
-    /// scale, also where the block is freshly rendered.
+    /// Residuals and their back-projections are K·c - y and Pᵀ·(K·c - y) of the whole images, at
+    /// any scale, also where the block is freshly rendered.
     #[test]
     fn back_projections_equal_those_of_the_operators() {
         for (lr, hr) in [

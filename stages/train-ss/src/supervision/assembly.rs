@@ -21,8 +21,8 @@ use crate::supersample::SupersampleSchedule;
 pub(crate) const REFERENCE_DRAWS: u64 = 4;
 
 impl Supersampling {
-    /// Creates a supervision by LR photographs and, optionally, HR references. Pixels that don't
-    /// count are neither drawn nor compared.
+    /// Creates a supervision by LR photographs and, optionally, HR references. Invalid pixels have
+    /// no loss; sampling avoids them, except in epochs, which contain all pixels.
     pub(crate) fn new(
         photographs: Photographs,
         references: Option<Photographs>,
@@ -43,7 +43,7 @@ impl Supersampling {
             assembly.add_reference(&view.camera, reference)?;
         }
         let view_count = assembly.views.len();
-        let counts = (assembly.index_count, assembly.unmasked_count);
+        let counts = (assembly.index_count, assembly.valid_count);
         Ok(Self {
             sampler: PixelSampler {
                 views: assembly.view_pixels,
@@ -83,8 +83,8 @@ struct Assembly<'a> {
     view_pixels: Vec<ViewPixels>,
     /// Total number of pixel indices.
     index_count: u64,
-    /// Number of indices of unmasked pixels, counted for importance sampling only.
-    unmasked_count: u64,
+    /// Number of indices of valid pixels, counted for importance sampling only.
+    valid_count: u64,
     /// Indices of pixels with detail.
     detailed: PixelSet,
     cache: Option<HrCache>,
@@ -110,7 +110,7 @@ impl<'a> Assembly<'a> {
             views: Vec::new(),
             view_pixels: Vec::new(),
             index_count: 0,
-            unmasked_count: 0,
+            valid_count: 0,
             detailed: PixelSet::default(),
             cache: options.needs_cache(lr_sizes).then(|| HrCache::new(supersample)),
             kernels: BTreeMap::new(),
@@ -135,7 +135,7 @@ impl<'a> Assembly<'a> {
         Ok(())
     }
 
-    /// Adds an HR reference, whose blocks of pixels are drawn in place of LR pixels.
+    /// Adds an HR reference, whose blocks of pixels are drawn as LR pixels are.
     fn add_reference(&mut self, camera: &Camera, reference: PackedPhotograph) -> io::Result<()> {
         let image = block_means(&reference.unmasked(), self.supersample);
         let masked = block_means(&reference.masked(), self.supersample);
@@ -147,14 +147,14 @@ impl<'a> Assembly<'a> {
         Ok(())
     }
 
-    /// Gives each pixel of a view `draws` indices. `unmasked` has the colours of all pixels.
+    /// Gives each pixel of a view `draws` indices. `unmasked` also has the masked pixels' colours.
     fn index_pixels(&mut self, image: &PackedPhotograph, unmasked: &Image, draws: u64) {
         if self.options.params.pixel_importance > 1.0 {
             let mut detailed = detailed_pixels(unmasked);
             for (pixel, is_detailed) in detailed.iter_mut().enumerate() {
                 let is_valid = image.is_valid(pixel);
                 *is_detailed &= is_valid;
-                self.unmasked_count += draws * u64::from(is_valid);
+                self.valid_count += draws * u64::from(is_valid);
             }
             for _ in 0..draws {
                 self.detailed.extend(detailed.iter().copied());

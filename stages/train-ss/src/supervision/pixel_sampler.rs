@@ -39,8 +39,8 @@ const EPOCH_STREAM: u64 = 110;
 const MAX_DRAWS: usize = 64;
 
 impl PixelSampler {
-    /// Returns the view and pixel that a bundle trains on. `is_valid` returns whether a view's
-    /// pixel is unmasked; epochs ignore `is_valid`, since they contain all pixels.
+    /// Returns the view and pixel that a bundle trains on. Epochs ignore `is_valid(view, pixel)`,
+    /// since they contain all pixels.
     pub(crate) fn draw(
         &self,
         bundle: u64,
@@ -100,7 +100,7 @@ pub(crate) struct Importance {
     /// Indices of the pixels with detail.
     detailed: PixelSet,
     /// Fraction of the draws that are uniform over all pixels; the others are uniform over detailed
-    /// pixels, which are unmasked.
+    /// pixels, which are valid.
     uniform_share: f32,
     flat_weight: f32,
     detailed_weight: f32,
@@ -108,20 +108,20 @@ pub(crate) struct Importance {
 
 impl Importance {
     /// Creates a sampler that draws detailed pixels `ratio` times as often as flat ones.
-    /// `unmasked_count` of the `index_count` indices are of unmasked pixels.
+    /// `valid_count` of the `index_count` indices are of valid pixels.
     pub(crate) fn new(
         ratio: f64,
-        (index_count, unmasked_count): (u64, u64),
+        (index_count, valid_count): (u64, u64),
         detailed: PixelSet,
     ) -> Self {
-        let detailed_share = detailed.len() as f64 / unmasked_count.max(1) as f64;
+        let detailed_share = detailed.len() as f64 / valid_count.max(1) as f64;
         if ratio <= 1.0 || detailed_share <= 0.0 {
             return Self { detailed, uniform_share: 1.0, flat_weight: 1.0, detailed_weight: 1.0 };
         }
         let uniform_share = 1.0 / (ratio - 1.0).mul_add(detailed_share, 1.0);
-        // Uniform draws of masked pixels are repeated, so there must be more of them.
-        let masked_share = 1.0 - unmasked_count as f64 / index_count as f64;
-        let drawn_share = uniform_share / (1.0 - masked_share * (1.0 - uniform_share));
+        // Uniform draws of invalid pixels are repeated, so there must be more uniform draws.
+        let invalid_share = 1.0 - valid_count as f64 / index_count as f64;
+        let drawn_share = uniform_share / (1.0 - invalid_share * (1.0 - uniform_share));
         Self {
             detailed,
             uniform_share: drawn_share as f32,

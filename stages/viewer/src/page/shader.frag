@@ -126,7 +126,7 @@ float distance_at(CubeRay ray, float t) {
   return ray.map.x + t * ray.map.y / (1.0 - t * ray.map.z);
 }
 
-// Returns the position at t in the unit cube, and the velocity, its derivative by t.
+// Returns the position at t in the unit cube, and the velocity, its derivative with respect to t.
 vec3 position_at(CubeRay ray, float t, out vec3 velocity) {
   velocity = ray.direction;
   if (space != CONTRACTION) return ray.origin + t * ray.direction;

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 /// Number of logical lanes of every kernel.
 pub const LANES: usize = 16;
 
-/// SIMD family of machine code; the discriminant is its code.
+/// SIMD family of machine code; the discriminant is its number in `CHOSEN`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Family {
     /// 512-bit vectors (x86-64-v4).
@@ -19,7 +19,7 @@ pub enum Family {
     Portable = 2,
 }
 
-/// Code of the chosen [`Family`]; another number before the first choice.
+/// Discriminant of the chosen [`Family`]; another number before the first choice.
 static CHOSEN: AtomicU8 = AtomicU8::new(u8::MAX);
 
 impl Family {
@@ -141,7 +141,8 @@ pub trait Lanes: Copy {
     fn positive(self) -> Self;
     /// Returns self in lanes where `gate` is above 0, otherwise 0.
     fn where_positive(self, gate: Self) -> Self;
-    /// Sums each of four values over its lanes by halves: first lanes 0 and 8, 1 and 9, ….
+    /// Returns the sum of the lanes of each of four values. Each pass adds the upper half of the
+    /// remaining lanes to the lower half: first lane 8 to lane 0, 9 to 1, ….
     fn sums(four: [Self; 4]) -> Self::Quad;
     /// Prefetches the first cache line of elements that are needed soon.
     fn prefetch<T>(_soon: &[T]) {}

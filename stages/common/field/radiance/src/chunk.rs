@@ -16,7 +16,8 @@ use numerics::simd::LANES;
 /// Number of rays in a chunk, whose samples fill the vectors and fit the cache (docs/design/006).
 pub(crate) const CHUNK_RAYS: usize = 64;
 
-/// Gradients by grid features, in sample order. Scattered to the grid after all shards have run.
+/// Gradients with respect to grid features, in sample order. Scattered to the grid after all shards
+/// have run.
 #[derive(Debug, Default)]
 pub(crate) struct FeatureGradients {
     pub(crate) positions: Vec<[f32; 3]>,
@@ -62,7 +63,8 @@ pub(crate) struct Chunk {
 /// Buffers of the backward pass through the density network.
 #[derive(Debug, Default)]
 struct BackwardBuffers {
-    /// Gradients by the density network's outputs: of the samples that count, then of the chosen.
+    /// Gradients with respect to the density network's outputs: of the samples that count, then of
+    /// the chosen.
     gradients: Vec<[f32; DENSITY_OUTPUTS]>,
     lengths: Aligned,
     /// Indices of the chosen samples, by round.

@@ -179,15 +179,15 @@ kernel! {
 /// Number of entries in half of a brick: a cache line, and a block of the optimiser.
 const HALF_BRICK: usize = BRICK / 2;
 
-/// Gradients by the entries of a level's table, in two arrays: entries whose vertices have an even
-/// z coordinate, and those with an odd one. Each cell has four corners in each array, so threads
-/// add to the arrays in parallel, with equal work and without sharing cache lines.
+/// Gradients with respect to the entries of a level's table, in two arrays: entries whose vertices
+/// have an even z coordinate, and those with an odd one. Each cell has four corners in each array,
+/// so threads add to the arrays in parallel, with equal work and without sharing cache lines.
 #[derive(Debug)]
 pub(crate) struct LevelGradients {
     pub(crate) halves: [HalfGradients; 2],
 }
 
-/// Gradients by the entries whose vertices have an even or an odd z coordinate.
+/// Gradients with respect to the entries whose vertices have an even or an odd z coordinate.
 #[derive(Debug)]
 pub(crate) struct HalfGradients {
     /// Lowest bit of the z coordinate.

@@ -1,7 +1,7 @@
 //! Regularisers: losses on a ray other than the error of its colour. Each has a weight and a
-//! function that adds the loss's gradient by each sample's weight. `torch-field` computes the
-//! losses for autograd. The distortion loss is checked in f64 here, the floater loss in
-//! `reference.rs`.
+//! function that adds the loss's gradient with respect to each sample's weight. `torch-field`
+//! computes the losses for autograd. The distortion loss is checked in f64 here, the floater loss
+//! in `reference.rs`.
 
 use crate::spec::MAX_FLOATER_COLOUR_DISTANCE;
 
@@ -40,7 +40,8 @@ impl Regularisers {
         Self { distortion: per_ray(self.distortion), floater_loss: per_ray(self.floater_loss) }
     }
 
-    /// Adds the losses' gradients by each sample's weight. `self` has the weights for one ray.
+    /// Adds the losses' gradients with respect to each sample's weight. `self` has the weights for
+    /// one ray.
     #[inline]
     pub(crate) fn add_gradients(&self, ray: &ShadedRay<'_>, by_weight: &mut [f32]) {
         let Self { distortion, floater_loss } = *self;
@@ -71,10 +72,10 @@ pub(crate) fn background_likeness(colour: [f32; 3], background: [f32; 3]) -> f32
     (1.0 - squared / (MAX_FLOATER_COLOUR_DISTANCE * MAX_FLOATER_COLOUR_DISTANCE)).max(0.0)
 }
 
-/// Adds the gradient by each weight w_i of the floater loss T·Σ_i w_i·[`background_likeness`]_i;
-/// `factor` is the loss's weight times T. There is no gradient by the colours, which would make
-/// floaters darker instead of thinner, or by the ray's transmittance T. The factor T spares opaque
-/// surfaces of the background's colour.
+/// Adds the gradient of the floater loss T·Σ_i w_i·[`background_likeness`]_i with respect to each
+/// weight w_i; `factor` is the loss's weight times T. There is no gradient with respect to the
+/// colours, which would make floaters darker instead of thinner, or to the ray's transmittance T.
+/// The factor T spares opaque surfaces of the background's colour.
 #[inline]
 fn add_floater_gradients(ray: &ShadedRay<'_>, factor: f32, by_weight: &mut [f32]) {
     for (by_weight, colour) in by_weight.iter_mut().zip(ray.colours()) {
@@ -82,9 +83,9 @@ fn add_floater_gradients(ray: &ShadedRay<'_>, factor: f32, by_weight: &mut [f32]
     }
 }
 
-/// Adds the gradient by each weight of the distortion loss, times `factor`. The loss Σ_ij
-/// w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i² concentrates a ray's weights. Unlike in eq. 15, a sample
-/// of a double stride counts as one step long, too.
+/// Adds the gradient of the distortion loss with respect to each weight, times `factor`. The loss
+/// Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i² concentrates a ray's weights. Unlike in eq. 15, a
+/// sample of a double stride counts as one step long, too.
 #[inline]
 fn add_distortion_gradients(ray: &ShadedRay<'_>, factor: f32, by_weight: &mut [f32]) {
     let ShadedRay { t, weight, step, .. } = *ray;

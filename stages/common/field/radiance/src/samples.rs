@@ -20,9 +20,9 @@ use numerics::simd::LANES;
 pub(crate) struct RaySum {
     pub(crate) colour: [f32; 3],
     pub(crate) transmittance: f32,
-    /// Σ w over the samples that count.
+    /// Σ w over the samples in [`Counted`].
     pub(crate) weight: f32,
-    /// Σ w·distance over the samples that count, in scene units.
+    /// Σ w·distance over the samples in [`Counted`], in scene units.
     pub(crate) distance: f32,
     /// Parameter t at which the transmittance falls below one half.
     pub(crate) median: Option<f32>,
@@ -122,7 +122,7 @@ pub(crate) struct Samples {
     depth: Vec<f32>,
     /// Rays that haven't ended.
     active: Vec<u32>,
-    /// Number of each ray's next step.
+    /// Index of each ray's next step, or [`DONE`].
     next: Vec<u32>,
 }
 
@@ -147,7 +147,7 @@ impl Samples {
         self.active.clear();
         self.active.extend(0..sums.len() as u32);
         counted.sample.clear();
-        counted.ray.clear();
+        counted.ray_of_sample.clear();
         while !self.active.is_empty() {
             self.march_round(field, rays, counted, sums);
         }
@@ -240,7 +240,7 @@ impl Samples {
             for i in range[0]..range[1] {
                 if self.transmittance[i] > MIN_TRANSMITTANCE && self.weight[i] > MIN_WEIGHT {
                     counted.sample.push(i as u32);
-                    counted.ray.push(r);
+                    counted.ray_of_sample.push(r);
                 }
             }
         }
@@ -271,10 +271,10 @@ pub(crate) struct Counted {
     /// Sample indices, by round.
     pub(crate) sample: Vec<u32>,
     /// Ray of each sample.
-    ray: Vec<u32>,
+    ray_of_sample: Vec<u32>,
     /// Indices in `sample`, by ray from front to back.
-    along: Vec<u32>,
-    /// First entry of each ray in `along`, and the end.
+    sorted_by_ray: Vec<u32>,
+    /// First entry of each ray in `sorted_by_ray`, and the end.
     ray_starts: Vec<usize>,
     /// Rays with at least one sample that counts.
     pub(crate) rays: Vec<u32>,
@@ -286,7 +286,7 @@ pub(crate) struct Counted {
 impl Counted {
     /// Returns the indices in `sample` of a ray's samples, from front to back.
     pub(crate) fn samples_of_ray(&self, ray: u32) -> &[u32] {
-        &self.along[self.ray_starts[ray as usize]..self.ray_starts[ray as usize + 1]]
+        &self.sorted_by_ray[self.ray_starts[ray as usize]..self.ray_starts[ray as usize + 1]]
     }
 
     /// Returns the maximum number of samples of a ray.
@@ -298,7 +298,7 @@ impl Counted {
     pub(crate) fn collect(&mut self, samples: &Samples, rays: usize) {
         self.ray_starts.clear();
         self.ray_starts.resize(rays + 1, 0);
-        for &r in &self.ray {
+        for &r in &self.ray_of_sample {
             self.ray_starts[r as usize + 1] += 1;
         }
         for r in 0..rays {
@@ -309,12 +309,12 @@ impl Counted {
             (0..rays as u32)
                 .filter(|&r| self.ray_starts[r as usize] < self.ray_starts[r as usize + 1]),
         );
-        self.along.clear();
-        self.along.resize(self.sample.len(), 0);
+        self.sorted_by_ray.clear();
+        self.sorted_by_ray.resize(self.sample.len(), 0);
         // Filling advances each ray's start to its end, which is the next ray's start.
-        for (k, &r) in self.ray.iter().enumerate() {
+        for (k, &r) in self.ray_of_sample.iter().enumerate() {
             let next = &mut self.ray_starts[r as usize];
-            self.along[*next] = k as u32;
+            self.sorted_by_ray[*next] = k as u32;
             *next += 1;
         }
         self.ray_starts.rotate_right(1);

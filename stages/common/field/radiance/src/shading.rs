@@ -44,14 +44,14 @@ struct AlongRay {
 /// Inputs of a backward pass, one entry per ray.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RayGradients<'a> {
-    /// Gradient by the colour over the background.
+    /// Gradient with respect to the colour over the background.
     pub(crate) colours: &'a [[f32; 3]],
     pub(crate) backgrounds: &'a [[f32; 3]],
     /// Weights of the regularisers for one ray.
     pub(crate) regularisers: Regularisers,
 }
 
-/// The networks' transposed weights, and the sums of gradients by the weights.
+/// The networks' transposed weights, and the sums of gradients with respect to the weights.
 pub(crate) struct NetworkGradients<'a> {
     pub(crate) transposed: &'a [f32],
     pub(crate) sums: &'a mut [f32],
@@ -67,8 +67,9 @@ pub(crate) enum LayerInput<'a> {
 }
 
 impl NetworkGradients<'_> {
-    /// Propagates `dy`, the gradient by a layer's outputs, to `dx`, the gradient by its input
-    /// before any ReLU: rows of n. Adds the gradient by the layer's weights.
+    /// Propagates `dy`, the gradient with respect to a layer's outputs, to `dx`, the gradient with
+    /// respect to the layer's input before any ReLU: rows of n. Adds the gradient with respect to
+    /// the layer's weights.
     pub(crate) fn backward(
         &mut self,
         layer: Layer,
@@ -155,8 +156,8 @@ kernel! {
 }
 
 kernel! {
-    /// Computes the gradient by each ray's view colour, three rows of n, from the samples' colours
-    /// `colour` and the gradients `colours` by each ray's colour.
+    /// Computes the gradient with respect to each ray's view colour, three rows of n, from the
+    /// samples' colours `colour` and the gradients `colours` with respect to each ray's colour.
     fn view_colour_gradients<L>(
         samples: &Samples, counted: &Counted, colour: &[f32], colours: &[[f32; 3]],
         gradient: &mut [f32], n: usize,
@@ -198,15 +199,16 @@ pub(crate) fn dot(a: &[f32; DENSITY_OUTPUTS], b: &[f32; DENSITY_OUTPUTS]) -> f32
 struct UpstreamGradient<'a> {
     /// Indices of the ray's samples among those that count, from front to back.
     indices: &'a [u32],
-    /// Gradient by the ray's colour.
+    /// Gradient with respect to the ray's colour.
     colour: [f32; 3],
-    /// Gradient by the composited outputs of the density network.
+    /// Gradient with respect to the composited outputs of the density network.
     composited: [f32; DENSITY_OUTPUTS],
 }
 
 kernel! {
-    /// Computes the gradients of one ray's samples by the density network's outputs, except by the
-    /// raw density. Fills `along` with transmittances, weights, t and the gradient by each weight.
+    /// Computes the gradients of one ray's samples with respect to the density network's outputs,
+    /// except the raw density. Fills `along` with transmittances, weights, t and the gradient with
+    /// respect to each weight.
     fn gradients_along<L>(
         samples: &Samples, counted: &Counted, colour: &[f32], ray: &UpstreamGradient<'_>,
         along: &mut AlongRay, gradients: &mut [[f32; DENSITY_OUTPUTS]],

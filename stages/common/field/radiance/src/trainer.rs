@@ -52,8 +52,8 @@ pub struct TrainingError {
     pub tensor: &'static str,
 }
 
-/// Target number of rays of a shard, unless [`SHARDS`] limits their number (docs/design/047). Fewer
-/// rays leave many SIMD lanes empty.
+/// Target number of rays of a shard, unless [`SHARDS`] limits the number of shards
+/// (docs/design/047). Fewer rays leave many SIMD lanes empty.
 const RAYS_PER_SHARD: usize = 40;
 /// Minimum and maximum number of shards of a step (docs/design/047).
 const SHARDS: RangeInclusive<usize> = 32..=128;
@@ -479,8 +479,8 @@ mod tests {
         field.grid.iter().chain(field.network.iter()).map(|x| x.to_bits()).collect()
     }
 
-    /// A trainer that fails to resume trains as if it had not tried. The error is either in the
-    /// weights' size, or in the occupancy, which is read last.
+    /// After a failed resume, a trainer trains as if there had been no attempt. The error is either
+    /// in the weights' size, or in the occupancy, which is read last.
     #[test]
     fn a_failed_resume_leaves_no_trace() {
         let folder = tempfile::tempdir().unwrap();

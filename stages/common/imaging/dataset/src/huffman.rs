@@ -11,8 +11,8 @@ const MAX_CODE_BITS: u32 = 16;
 pub(crate) struct Table {
     /// Code length and symbol, indexed by the next bits; length 0 for longer codes.
     lookup: Vec<(u8, u8)>,
-    /// First 16 bits after all codes of a length, and the symbol's index minus the code; indexed by
-    /// the length.
+    /// Exclusive upper bound of the 16 bits that begin with a code of at most a length, and a
+    /// symbol's index minus its code; indexed by the length.
     ends: [(u32, i32); MAX_CODE_BITS as usize + 1],
     symbols: Vec<u8>,
 }
@@ -123,7 +123,7 @@ impl<'a> Bits<'a> {
         self.offset
     }
 
-    /// Skips a block of a scan with DC; `None` if data end or a code is invalid.
+    /// Skips a block of a scan with DC; `None` if the data end or a code is invalid.
     pub(crate) fn skip_block(&mut self, band: Band, tables: [Option<&Table>; 2]) -> Option<()> {
         let [dc, ac] = tables;
         let length = match dc {
@@ -148,8 +148,8 @@ impl<'a> Bits<'a> {
         Some(())
     }
 
-    /// Skips a block of a progressive scan without DC (G.1.2.2 and G.1.2.3). `known` has the bits
-    /// of non-zero coefficients; those of new ones are added.
+    /// Skips a block of a progressive scan without DC (G.1.2.2 and G.1.2.3). `known` is a bit mask
+    /// of the non-zero coefficients; new ones are added.
     pub(crate) fn skip_band(&mut self, band: Band, table: &Table, known: &mut u64) -> Option<()> {
         let mut coefficient = band.first;
         while self.empty_blocks == 0 && coefficient <= band.last {

@@ -31,7 +31,8 @@ const DRI: u8 = 0xdd;
 
 /// Maximum number of scans, zune-jpeg's default.
 const MAX_SCANS: usize = 100;
-/// Minimum number of zeros at the end of a file that can't be image data; chosen by hand.
+/// Minimum number of zeros at the end of a file that are removed, since so many can't be image
+/// data; chosen by hand.
 const MIN_PADDING_BYTES: usize = 16;
 
 /// Returns whether zune-jpeg knows a marker.
@@ -46,10 +47,10 @@ pub(crate) enum Completeness {
     Complete,
     /// Invalid segment before the first scan, or no frame header.
     UnreadableHeader,
-    /// Complete rows without an end marker that the decoder reaches. The image data end at offset
-    /// `end`.
+    /// Complete rows of a sequential JPEG in which the decoder reaches no end marker. The image
+    /// data end at offset `end`.
     Unterminated { end: usize },
-    /// Incomplete rows, of the image's height in rows.
+    /// Sequential JPEG with `rows` incomplete rows out of `height`.
     Missing { rows: u32, height: u32 },
     /// Progressive JPEG without all detail; `scan` is the first incomplete or the last scan,
     /// counted from 1.
@@ -85,7 +86,8 @@ struct Component {
     factors: [u32; 2],
     /// Number of incomplete image rows; `None` before the component's first scan.
     missing: Option<u32>,
-    /// Bits of the non-zero coefficients of each block, for a progressive JPEG.
+    /// Mask of each block's non-zero coefficients, one bit per coefficient; only for a progressive
+    /// JPEG.
     coefficients: Vec<u64>,
 }
 
@@ -298,7 +300,7 @@ impl Grid {
         self.columns * self.rows
     }
 
-    /// Counts incomplete image rows; `skip` skips an MCU, and returns `None` if data end.
+    /// Counts incomplete image rows; `skip` skips an MCU, and returns `None` if the data end.
     fn incomplete_rows(
         &self,
         bits: &mut Bits<'_>,

@@ -91,7 +91,7 @@ fn find_model(folder: &Path) -> Option<String> {
     }
     Some(match near.iter().find(has_images) {
         Some(images) => format!(
-            "{found} and images in {}; rename these folders sparse/0 and images",
+            "{found} and images in {}; rename these folders to sparse/0 and images",
             relative(images)
         ),
         None => format!("{found}, but no images; put the model in sparse/0 next to images"),

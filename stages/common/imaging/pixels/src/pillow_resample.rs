@@ -74,7 +74,7 @@ const PRECISION_BITS: u32 = 32 - 8 - 2;
 /// One half, for rounding.
 const HALF: i32 = 1 << (PRECISION_BITS - 1);
 
-/// Returns the run of inputs of each output: the first input, and normalised weights.
+/// Returns, for each output, its first input, and the normalised weights of the inputs from there.
 pub(crate) fn coefficients(input: usize, output: usize, filter: Filter) -> Vec<(usize, Vec<f64>)> {
     let scale = input as f64 / output as f64;
     let stretch = scale.max(1.0);
@@ -114,7 +114,7 @@ fn clip(accumulated: i32) -> u8 {
     (accumulated >> PRECISION_BITS).clamp(0, 255) as u8
 }
 
-/// Resizes an image with the bits of Pillow's `Image.resize((width, height), filter)` on RGBA.
+/// Resizes an image to the same bits as Pillow's `Image.resize((width, height), filter)` on RGBA.
 ///
 /// # Panics
 /// If a side is 0.

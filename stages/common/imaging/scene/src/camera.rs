@@ -83,8 +83,8 @@ impl CameraError {
 /// the product of two depths must be finite.
 const MAX_CENTRE_DISTANCE: f64 = 1e18;
 
-/// Minimum cosine of the angle between a camera's and the mean direction of forward-facing cameras:
-/// cos 45° (docs/design/004).
+/// Minimum cosine of the angle between the direction of a forward-facing camera and the mean
+/// direction of all cameras: cos 45° (docs/design/004).
 const MIN_COMMON_DIRECTION_COSINE: f64 = 0.707;
 
 /// Returns the mean viewing direction of forward-facing cameras; `None` for other cameras.

@@ -1,5 +1,5 @@
-//! Number of rays and peak memory of stages: rules that a stage follows and that the runner
-//! estimates a run with, before the stage's inputs exist.
+//! Number of rays and peak memory of stages. A stage follows these rules, and the runner estimates
+//! a run by them before the stage's inputs exist.
 //!
 //! * [`RayBudget`]: rays of a training, from the LR pixels.
 //! * [`TrainingMemory`], [`preparation_bytes`], [`export_bytes`]: peak memory.
@@ -22,8 +22,8 @@ pub fn preparation_bytes(reading: u64, photograph_pixels: u64, hr_pixels: u64) -
     reading.max(PHOTOGRAPH_BYTES * photograph_pixels + HR_BYTES * hr_pixels)
 }
 
-/// Maximum number of pixels of all rendered views together, unless their width is given; chosen by
-/// hand.
+/// Maximum number of pixels of all views that `export` renders, unless their width is given; chosen
+/// by hand.
 const MAX_PIXELS: f64 = 16e6;
 /// Maximum size of the rendered views relative to the cameras: a supersampled field has more detail
 /// than the cameras' pixels (design note 043).

@@ -73,7 +73,8 @@ impl<'a> LrObservations<'a> {
             let zeros = Image { data: vec![0.0; residual.data.len()], ..residual.clone() };
             mask.fill(&mut residual, &zeros);
         }
-        // K⁺ = s·Pᵀ along each axis (`AxisTaps::inverse`), with the scales s of both axes.
+        // K⁺ = s·Pᵀ along each axis, with P of `AxisTaps::inverse` and s HR pixels per LR pixel.
+        // This is the product of both axes' s.
         let pixels_per_lr_pixel =
             (refined.width * refined.height) as f32 / (photograph.width * photograph.height) as f32;
         let mut projected = kernel.inverse(INVERSE_RADIUS_LR_PIXELS).adjoint(&residual);

@@ -9,7 +9,7 @@ use crate::convolution::{
 pub(crate) struct Pass {
     /// Input of each layer, and the output of the last.
     maps: Vec<Maps>,
-    /// Gradients by a layer's output, by its input, and by a residual block's output.
+    /// Gradients with respect to a layer's output, its input, and a residual block's output.
     gradient_maps: [Maps; 3],
     /// Sums of the gradients of all backward passes since [`Pass::reset`].
     pub(crate) gradients: Vec<LayerGradients>,

@@ -1,5 +1,5 @@
-//! The Slurm executor: submits a job for each node that isn't cached and for each sink, then exits
-//! (docs/design/032).
+//! The Slurm executor: submits a job for each node or sink that is neither done nor queued, then
+//! exits (docs/design/032).
 
 use std::fs::{self, File};
 use std::path::Path;

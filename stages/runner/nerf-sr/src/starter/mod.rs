@@ -5,7 +5,8 @@
 //!   with the shipped targets. Existing files are never overwritten.
 //!
 //! If every image is wider than [`MAX_WIDTH`] pixels, all are shrunk first: on a CPU, training on
-//! photographs of twelve million pixels takes hours. Otherwise, all keep their size.
+//! photographs of twelve million pixels takes hours. Otherwise, only images of a benchmark are
+//! downscaled, for training.
 
 mod unposed;
 
@@ -164,10 +165,10 @@ fn sizes(set: &Dataset) -> String {
             format!("training at {}, views at {width}", width / SCALE)
         }
         (ImageSource::Benchmark, None) => {
-            format!("training at 1/{SCALE} of this size, views at this size")
+            format!("training at 1/{SCALE} of their size, views at their size")
         }
         (ImageSource::Photographs, _) => {
-            return format!("{photographs}; training at this size, {unshrunk_views}");
+            return format!("{photographs}; training at their size, {unshrunk_views}");
         }
     };
     format!("{photographs}; {training}; `-p lr_source=photographs` gives {unshrunk_views}")

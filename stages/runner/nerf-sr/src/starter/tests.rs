@@ -65,12 +65,12 @@ fn sizes_are_described() {
         (
             Format::Colmap,
             vec![(640, 480)],
-            "photographs 640×480; training at this size, views at 1280",
+            "photographs 640×480; training at their size, views at 1280",
         ),
         (
             Format::Colmap,
             vec![(640, 480), (480, 640)],
-            "photographs of several sizes; training at this size, views 2 times as wide as each \
+            "photographs of several sizes; training at their size, views 2 times as wide as each \
             photograph",
         ),
     ] {

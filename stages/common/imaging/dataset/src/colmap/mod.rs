@@ -23,20 +23,22 @@ use crate::lookup::{Listings, Lookup, reduced_copies};
 use crate::photograph::is_image_name;
 use model::{Model, find_list};
 
-/// Finds the models in `sparse` and its sub-folders, sorted by name. If there are none and the
-/// folder has photographs, the folder itself may be a model; otherwise searches the `sparse` of
-/// each sub-folder without photographs: nerfstudio writes `colmap/sparse/0`.
+/// Finds the models in `sparse` and its sub-folders, sorted by name. If there are none, the folder
+/// itself may be a model, provided that it has photographs or a folder of photographs. If it isn't
+/// a model but has a folder of photographs, searches `sparse` of each sub-folder without such a
+/// folder: nerfstudio writes `colmap/sparse/0`.
 pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, FileProblem> {
     let found = folders_with_list(folder, "images")?;
     if !found.is_empty() {
         return Ok(found);
     }
-    let has_folder = has_images(folder);
-    if is_model(folder) && (has_folder || visible_entries(folder).iter().any(|f| is_image_name(f)))
+    let has_image_folder = has_images(folder);
+    if is_model(folder)
+        && (has_image_folder || visible_entries(folder).iter().any(|f| is_image_name(f)))
     {
         return Ok(vec![folder.to_path_buf()]);
     }
-    if !has_folder {
+    if !has_image_folder {
         return Ok(found);
     }
     let mut sub_folders = visible_entries(folder);
@@ -53,8 +55,8 @@ pub(crate) fn is_model(folder: &Path) -> bool {
     ["images", "cameras"].iter().all(|name| matches!(find_list(folder, name), Ok(Some(_))))
 }
 
-/// True if an image of the first model exists, also in a wrong sub-folder, or the model can't be
-/// read.
+/// Returns whether an image of the first model exists, even in a wrong sub-folder. Also true if
+/// there is no model, or if it can't be read.
 pub(crate) fn has_photographs(folder: &Path) -> bool {
     let mut model = Model::default();
     let models = find_models(folder).unwrap_or_default();
@@ -153,8 +155,8 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Dataset> {
     Ok(Dataset { format: Format::Colmap, frames, split: None, notes })
 }
 
-/// Returns the reason for a model none of whose images exists, with the sub-folder that contains
-/// the first image, if any.
+/// Returns the error for a model without any existing image. The error names the sub-folder that
+/// contains the first image, if there is one.
 fn no_photographs(lookup: &Lookup, missing: &[&String]) -> anyhow::Error {
     let Some(first) = missing.first() else {
         return anyhow!("the model has no images; at least one is required");
@@ -163,7 +165,7 @@ fn no_photographs(lookup: &Lookup, missing: &[&String]) -> anyhow::Error {
     match folder_of_image(lookup.root(), first) {
         Some(found) => {
             let name = name_text(&found);
-            anyhow!("{reason}; the image is in {name}: rename this folder images")
+            anyhow!("{reason}; the image is in {name}: rename this folder to images")
         }
         None => reason,
     }
@@ -175,11 +177,12 @@ fn folder_of_image(folder: &Path, image: &str) -> Option<PathBuf> {
     sub_folders(folder).into_iter().find(|path| path.join(&image).is_file())
 }
 
-/// Ratio of all photographs to those without a camera from which a note is a warning.
-const MIN_UNREGISTERED_RATIO: usize = 10;
+/// Maximum ratio of all photographs to those without a camera at which the note is a warning.
+const MAX_PHOTOGRAPHS_PER_UNREGISTERED: usize = 10;
 
-/// Returns the note on photographs next to the model's `files` that have no camera, if any. Masks
-/// and depth images usually have another format.
+/// Returns the note on photographs without a camera in the folders of the model's `files`, if there
+/// are any. Only files with the same extension count: masks and depth images usually have another
+/// one.
 fn unregistered_note(folder: &Path, files: &[PathBuf]) -> Option<String> {
     let used: BTreeSet<&PathBuf> = files.iter().collect();
     let kinds: BTreeSet<_> = files.iter().map(|file| (file.parent(), file.extension())).collect();
@@ -196,7 +199,7 @@ fn unregistered_note(folder: &Path, files: &[PathBuf]) -> Option<String> {
         }
     }
     let first = path_text(unregistered.first()?);
-    let is_many = MIN_UNREGISTERED_RATIO * unregistered.len() >= count;
+    let is_many = MAX_PHOTOGRAPHS_PER_UNREGISTERED * unregistered.len() >= count;
     let (warning, photographs) =
         (if is_many { WARNING } else { "" }, format_count(count, "photograph"));
     let have = if unregistered.len() == 1 { "has" } else { "have" };

@@ -46,8 +46,8 @@ pub(super) fn removed_points_note(removed: usize, all: usize) -> String {
 /// hand.
 const DEPTH_QUANTILES: [f64; 2] = [0.001, 0.999];
 
-/// Returns the [nearest, farthest] depth of the points that an image observes, or distance with a
-/// fisheye lens. `None` unless two depths differ.
+/// Returns the [`DEPTH_QUANTILES`] of the depths of the points that an image observes, or of their
+/// distances with a fisheye lens. `None` unless the quantiles differ.
 pub(super) fn depth_range(
     image: &Image,
     camera: &Intrinsics,

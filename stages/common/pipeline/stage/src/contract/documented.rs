@@ -32,7 +32,8 @@ pub struct ParameterDoc {
     pub choices: Vec<(String, String)>,
 }
 
-/// Group of parameters: those common to all variants of a stage, or those of one variant.
+/// Section of the documentation: parameters common to all variants of a stage, or those of one
+/// variant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ParameterSection {
     /// Variant that the parameters belong to, such as `field: grid`; `None` for common ones.
@@ -45,7 +46,7 @@ impl Description {
     /// Documents the stage's parameters: the common ones, then those of each variant.
     pub fn parameter_sections(&self) -> Vec<ParameterSection> {
         let schema = &self.parameters;
-        // Two tags are an error of `Description::check`, which precedes every use.
+        // A schema with an invalid tag gets one section; `Description::check` refuses it.
         let Some(tag) = Tag::find(schema).ok().flatten() else {
             return vec![ParameterSection {
                 variant: None,

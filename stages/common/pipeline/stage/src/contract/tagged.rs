@@ -95,7 +95,7 @@ impl Tag {
         unnested
     }
 
-    /// Returns the index of the selected variant; `None` if no or an unknown one is selected.
+    /// Returns the index of the selected variant; `None` if none or an unknown one is selected.
     pub(crate) fn selected(&self, flat: &Map<String, Value>) -> Option<usize> {
         let name = flat.get(&self.name)?.as_str()?;
         self.variants().position(|variant| variant == name)
@@ -130,7 +130,7 @@ impl Tag {
         Value::Object(nested)
     }
 
-    /// Returns the message for a parameter that only a variant that is not selected has.
+    /// Returns the message for a parameter of `variant`, which isn't selected.
     pub(crate) fn other_variant_message(&self, variant: usize) -> String {
         format!(
             "belongs to {0}: {1}; leave it out, or choose {0}: {1}",

@@ -347,9 +347,10 @@ fn are_equal(a: &Value, b: &Value) -> bool {
     }
 }
 
-/// Returns the exact value of a whole number; `None` for fractions.
+/// Returns the exact value of a whole number; `None` for fractions and for floats of magnitude
+/// `LIMIT` or more.
 pub(crate) fn exact_integer(number: &Number) -> Option<i128> {
-    /// Bound of the floats that are converted: above 64 bits, and within `i128`.
+    /// Bound of the floats that are converted: larger than any 64-bit integer, and within `i128`.
     const LIMIT: f64 = 1e36;
     if let Some(value) = number.as_u64().map(i128::from).or(number.as_i64().map(i128::from)) {
         return Some(value);
