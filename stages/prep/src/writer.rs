@@ -71,8 +71,8 @@ impl<'a> SceneWriter<'a> {
             sum.add(*clipping);
         }
         Some(format!(
-            "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and clipped to 1, in {count} of \
-            {} (first: frame {first}); to keep them, scale the files to at most 1",
+            "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and clipped to 1, in {count} \
+            of {} (first: frame {first}); to keep them, scale the files to at most 1",
             sum.clipped,
             sum.pixels,
             100.0 * sum.clipped as f64 / sum.pixels as f64,

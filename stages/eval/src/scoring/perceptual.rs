@@ -93,7 +93,8 @@ impl Perceptual {
     pub(crate) fn new(weights: Option<&GivenInput>, min_side: usize) -> anyhow::Result<Self> {
         if weights.is_some() {
             artifact::bail_usage!(
-                "input weights: LPIPS needs libtorch, and eval was built without it; run `make build`"
+                "input weights: LPIPS needs libtorch, and eval was built without it; run \
+                `make build`"
             );
         }
         Ok(Self { given: Vec::new(), min_side })

@@ -31,8 +31,8 @@ const DRI: u8 = 0xdd;
 
 /// Maximum number of scans, zune-jpeg's default.
 const MAX_SCANS: usize = 100;
-/// Minimum number of zeros at the end of a file that are removed, since so many can't be image
-/// data; chosen by hand.
+/// Minimum number of zeros at the end of a file that are removed: image data don't end in as many;
+/// chosen by hand.
 const MIN_PADDING_BYTES: usize = 16;
 
 /// Returns whether zune-jpeg knows a marker.

@@ -262,8 +262,8 @@ fn parent<'n>(node: &'n Node, input: &str) -> Option<(usize, Option<&'n str>)> {
     }
 }
 
-/// Returns the images that a node of `prep` has made or will make. `datasets` has the data sets that
-/// were read already.
+/// Returns the images that a node of `prep` has made or will make. `datasets` has the data sets
+/// that were read already.
 fn scene_images<'p>(
     plan: &'p Plan,
     state: &State,
