@@ -330,7 +330,7 @@ fn estimates_follow_the_photographs() {
         .map(|path| -> Value { serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap() });
     let trainings: Vec<Value> = records.filter(|record| record["stage"] == "train-ss").collect();
     assert_eq!(trainings.len(), 1);
-    assert_eq!(trainings[0]["model"]["is_opaque"], true, "{}", trainings[0]);
+    assert_eq!(trainings[0]["model"]["scene"], "unbounded", "{}", trainings[0]);
 }
 
 /// Estimates for a camera path use the number and size of frames in its parameters or its file.

@@ -62,10 +62,30 @@ pub struct ModelCost {
     pub processor_seconds: f64,
     /// Peak resident memory of the process in bytes.
     pub peak_memory: u64,
-    /// True if the model took every ray of the scene to hit a surface; missing for stages that cast
+    /// Kind of scene by which the model estimated the cost of a ray; missing for stages that cast
     /// no rays, and in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub is_opaque: Option<bool>,
+    pub scene: Option<SceneKind>,
+}
+
+/// Kind of scene, on which the cost of a ray depends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum SceneKind {
+    /// Object before a background of one colour: most rays miss it.
+    #[default]
+    Object,
+    /// Opaque scene in NDC.
+    Frustum,
+    /// Opaque scene all around the cameras.
+    Unbounded,
+}
+
+impl SceneKind {
+    /// Returns whether every ray hits a surface.
+    pub fn is_opaque(self) -> bool {
+        self != Self::Object
+    }
 }
 
 impl Record {

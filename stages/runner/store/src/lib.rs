@@ -44,7 +44,7 @@ mod run;
 #[cfg(test)]
 mod testing;
 
-pub use action::{KEY_VERSION, KEY_VERSION_PART, ModelCost, Record, Unfinished};
+pub use action::{KEY_VERSION, KEY_VERSION_PART, ModelCost, Record, SceneKind, Unfinished};
 pub use attempt::{Arrival, Attempt, CheckedOutput, TimeSpent};
 pub use error::{StoreError, is_lock_acquired};
 pub use folder::Store;

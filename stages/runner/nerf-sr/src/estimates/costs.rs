@@ -118,8 +118,8 @@ pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Opti
     };
     let start = if matches!(program, "prep" | "demo-scene") { 0.0 } else { START_SECONDS };
     let casts_rays = matches!(program, "demo-scene" | "train-ss" | "render-depth" | "export");
-    let is_opaque = casts_rays.then(|| work.kind.is_opaque());
-    Some(ModelCost { processor_seconds: start + seconds, peak_memory, is_opaque })
+    let scene = casts_rays.then_some(work.kind);
+    Some(ModelCost { processor_seconds: start + seconds, peak_memory, scene })
 }
 
 /// Returns the memory below which a stage fails. If memory is short, a training stores pixels in a
@@ -274,7 +274,9 @@ mod tests {
     use serde_json::json;
 
     use super::super::scene::SceneImages;
-    use super::super::work::{Images, SceneKind};
+    use store::SceneKind;
+
+    use super::super::work::Images;
     use super::*;
 
     /// Returns work with square images; the field's LR width is their width.

@@ -225,7 +225,7 @@ fn is_similar(record: &Record, program: &str, model: ModelCost) -> bool {
     record.key_parts.get("stage").and_then(Value::as_str) == Some(program)
         && record.processor_seconds.is_some_and(|seconds| seconds >= MIN_RECORD_SECONDS)
         && (1.0 / MAX_TIME_FACTOR..MAX_TIME_FACTOR).contains(&factor)
-        && other.is_opaque == model.is_opaque
+        && other.scene == model.scene
 }
 
 /// Returns the parts of a node's key that are known while inputs are unknown: the program and the
@@ -289,11 +289,13 @@ fn scene_images<'p>(
 
 #[cfg(test)]
 mod tests {
+    use store::SceneKind;
+
     use super::*;
 
     #[test]
     fn an_earlier_run_corrects_the_model() {
-        let model = ModelCost { processor_seconds: 10.0, peak_memory: 1000, is_opaque: None };
+        let model = ModelCost { processor_seconds: 10.0, peak_memory: 1000, scene: None };
         let record = |seconds, memory| Record {
             processor_seconds: Some(seconds),
             peak_memory: Some(memory),
@@ -310,21 +312,24 @@ mod tests {
 
     #[test]
     fn runs_of_equal_programs_scenes_and_sizes_are_similar() {
-        let cost = |processor_seconds, is_opaque| ModelCost {
+        let cost = |processor_seconds, scene| ModelCost {
             processor_seconds,
-            is_opaque: Some(is_opaque),
+            scene: Some(scene),
             ..ModelCost::default()
         };
         let record = Record {
             key_parts: [("stage".to_owned(), json!("render-depth"))].into_iter().collect(),
             processor_seconds: Some(10.0),
-            model: Some(cost(20.0, false)),
+            model: Some(cost(20.0, SceneKind::Frustum)),
             ..Record::default()
         };
         let is_similar = |program, model| is_similar(&record, program, model);
-        assert!(is_similar("render-depth", cost(30.0, false)));
-        assert!(!is_similar("render-depth", cost(30.0, true)), "another kind of scene");
-        assert!(!is_similar("render-depth", cost(300.0, false)), "another size");
-        assert!(!is_similar("train-ss", cost(30.0, false)), "another program");
+        assert!(is_similar("render-depth", cost(30.0, SceneKind::Frustum)));
+        assert!(
+            !is_similar("render-depth", cost(30.0, SceneKind::Unbounded)),
+            "another kind of scene"
+        );
+        assert!(!is_similar("render-depth", cost(300.0, SceneKind::Frustum)), "another size");
+        assert!(!is_similar("train-ss", cost(30.0, SceneKind::Frustum)), "another program");
     }
 }

@@ -9,9 +9,10 @@ use pixels::{DEGRADATION_FILE, Filter, Kernel};
 use scene::{Background, Intrinsics, Space, VIEWS_FILE, Views};
 use serde::Deserialize;
 use serde_json::Value;
+use store::SceneKind;
 use workload::preparation_bytes;
 
-use super::work::{Images, SceneKind};
+use super::work::Images;
 
 /// Width of the field's cube in NDC, in widths of an LR image, before the frustum is known: that of
 /// `fern`.

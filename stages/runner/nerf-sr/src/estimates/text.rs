@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     fn estimate(processor_seconds: f64, memory: u64) -> Estimate {
-        let model = ModelCost { processor_seconds, peak_memory: memory, is_opaque: None };
+        let model = ModelCost { processor_seconds, peak_memory: memory, scene: None };
         Estimate { processor_seconds, memory, min_memory: memory / 2, model }
     }
 

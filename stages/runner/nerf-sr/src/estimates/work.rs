@@ -3,27 +3,9 @@
 use radiance::{Architecture, GivenSizes};
 use serde::Deserialize as _;
 use serde_json::Value;
+use store::SceneKind;
 
 use super::scene::SceneImages;
-
-/// Kind of scene, on which the cost of a ray depends.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) enum SceneKind {
-    /// Object before a background of one colour: most rays miss it.
-    #[default]
-    Object,
-    /// Opaque scene in NDC.
-    Frustum,
-    /// Opaque scene all around the cameras.
-    Unbounded,
-}
-
-impl SceneKind {
-    /// Returns whether every ray hits a surface.
-    pub(crate) fn is_opaque(self) -> bool {
-        self != Self::Object
-    }
-}
 
 /// Number and sizes of the images of a folder.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

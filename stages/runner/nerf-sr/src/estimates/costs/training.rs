@@ -3,10 +3,11 @@
 use radiance::GivenSizes;
 use serde::Deserialize as _;
 use serde_json::Value;
+use store::SceneKind;
 use workload::{PixelStorage, RayBudget, TrainingMemory, grid_training_bytes, program_bytes};
 
 use super::number;
-use crate::estimates::work::{SceneKind, Work};
+use crate::estimates::work::Work;
 
 /// Costs of training in a kind of scene.
 #[derive(Clone, Copy)]
