@@ -12,26 +12,27 @@ const MIN_GAP: f64 = TAU / 8.0;
 /// Minimum ratio of this angle to the median angle between neighbouring cameras, so that few
 /// cameras all around give a circle. Chosen by hand.
 const MIN_GAP_OVER_MEDIAN: f64 = 3.0;
-/// Minimum distance of a camera from the axis over the orbit's radius: nearer cameras look down,
-/// and their angles around the axis mean little. Chosen by hand.
+/// Minimum distance of a camera from the axis, as a fraction of the orbit's radius: nearer cameras
+/// look down, and their angles around the axis mean little. In a panorama, minimum horizontal part
+/// of a unit viewing direction. Chosen by hand.
 const MIN_AXIS_DISTANCE: f64 = 0.25;
-/// Maximum mean distance of cameras at one position from the middle of the scene's box, as a share
-/// of the box's longest side: far above rounding errors; chosen by hand.
+/// Maximum mean distance of a panorama's cameras from the middle of the scene's box, as a fraction
+/// of the box's longest side. Far above rounding errors; chosen by hand.
 const MAX_PANORAMA_DISTANCE: f64 = 1e-6;
 /// Steps of [`up_direction`]: enough for level cameras along an arc of 40°; chosen by hand.
 const UP_STEPS: u32 = 100;
 
-/// Circle around the middle of the scene's box, or an arc of this circle. From cameras at one
-/// position, its frames are there and face outwards.
+/// Circle around the middle of the scene's box, or an arc of this circle. For a panorama, whose
+/// cameras are all at the middle, the frames are at the middle, too, and face outwards.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Orbit {
     middle: DVec3,
     up: DVec3,
     /// Direction from the axis to the frame at angle 0.
     first: DVec3,
-    /// Radius; 0 for cameras at one position.
+    /// Radius; 0 for a panorama.
     radius: f64,
-    /// Height above the middle; 0 for cameras at one position.
+    /// Height above the middle; 0 for a panorama.
     height: f64,
     /// Maximum angle to both sides of `first` in radians; `None` for a whole circle.
     half_arc: Option<f64>,
@@ -192,10 +193,10 @@ mod tests {
         assert!(up_direction(&rolled).dot(rolled[0].rotation().y_axis) > 0.9999);
     }
 
-    /// Frames of cameras at one position, up to rounding, look all around or, for an arc, where the
+    /// Frames of cameras at the middle, up to rounding, look all around or, for an arc, where the
     /// cameras look.
     #[test]
-    fn cameras_at_one_position_give_a_panorama() {
+    fn cameras_at_the_middle_give_a_panorama() {
         for (count, arc) in [(12, None), (5, Some(120.0))] {
             let outwards = cameras((0..count).map(|i| 30.0 * f64::from(i)), 0.0);
             let at_centre = outwards.iter().map(|c| {

@@ -31,7 +31,8 @@ const SPLAT_OPACITY: f64 = 0.6;
 /// Minimum and maximum opacity of a splat: the logit of 0 or 1 is infinite.
 const SPLAT_OPACITY_BOUNDS: [f64; 2] = [0.02, 0.99];
 
-/// Selects the surfels that become points: those with certain normals, or all if there are none.
+/// Selects the surfels that become points: all but those with uncertain normals, or all surfels if
+/// every normal is uncertain.
 pub(crate) fn select_points(surfels: &[Surfel]) -> Vec<Surfel> {
     let is_certain = |surfel: &&Surfel| surfel.margin > MAX_UNCERTAIN_MARGIN_PIXELS;
     let certain: Vec<Surfel> = surfels.iter().filter(is_certain).copied().collect();

@@ -281,8 +281,8 @@ impl SurfaceView {
     }
 }
 
-/// Maximum difference in depth between a point and its pixel, over the maximum distance from the
-/// surface: as on surfaces slanted by 76°; source not recorded.
+/// Maximum ratio of the difference in depth between a point and the point's pixel to the maximum
+/// distance from the surface: as on surfaces slanted by 76°; source not recorded.
 const MAX_DEPTH_RATIO: f32 = 4.0;
 
 /// Converts a rendered pixel; `z_per_distance` is z-depth per distance along the pixel's ray.

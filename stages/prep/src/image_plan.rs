@@ -88,7 +88,7 @@ impl ImagePlan {
         (scaled_length(width, hr.0, lr.0), scaled_length(height, hr.1, lr.1))
     }
 
-    /// Returns the width of the photographs over that of the LR images.
+    /// Returns the ratio of the photographs' width to that of the LR images.
     pub(crate) fn lr_factor(&self) -> f64 {
         f64::from(self.native.0) / f64::from(self.sizes.lr.0)
     }

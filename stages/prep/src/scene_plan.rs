@@ -55,7 +55,7 @@ fn bounds(
     params: &Params,
     background: Background,
 ) -> Result<Bounds, Failure> {
-    // Given near and far replace unknown depths of views.
+    // If both `near` and `far` are given, they replace unknown depths of views.
     let given = params
         .near
         .zip(params.far)

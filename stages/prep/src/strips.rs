@@ -12,7 +12,7 @@ const MIN_FLAT_PERCENT: usize = 95;
 /// Maximum percentage of pixels with the strip's colour in the line next to a strip, and in the
 /// corners inside all strips. An object on a background exceeds it: its corners are empty.
 const MAX_INSIDE_PERCENT: usize = 50;
-/// Side of the image inside the strips over the side of a corner.
+/// Ratio of the image's side inside the strips to the side of a corner.
 const CORNER_DIVISOR: usize = 8;
 /// Number of lines that interpolation blends at a strip's edge.
 const BLENDED_LINES: usize = 1;

@@ -19,8 +19,8 @@ use stage::{Context, Input, Output, Stage};
 #[serde(default, deny_unknown_fields)]
 pub struct Params {}
 
-/// Number of times that a photograph is halved at the start; more halvings register cameras with
-/// larger errors; chosen by hand.
+/// Maximum number of times that a photograph is halved for the first fit. With more halvings, the
+/// given cameras may have larger errors. Chosen by hand.
 const PYRAMID_LEVELS: u32 = 3;
 /// Maximum number of times that the field is rendered for a photograph, at each of its sizes;
 /// chosen by hand.

@@ -34,7 +34,7 @@ pub struct Params {
     pub size: Option<u32>,
     /// Rays along each side of a pixel. 1 casts one ray through the pixel's centre; a larger n
     /// casts n × n further rays. The colour is then the mean of the centre's colour and the further
-    /// rays' mean. The depth is that of one further ray.
+    /// rays' mean. The depth is the lower median of the further rays' depths.
     #[schemars(range(min = 1, max = 8))]
     pub samples_per_axis: u32,
     /// Maximum error of colour or opacity of a pixel with one ray; pixels with a larger error get
@@ -220,7 +220,7 @@ impl RenderJob<'_> {
 }
 
 /// Combines the samples of a pixel's rays, each with its z-depth per distance: means of colour and
-/// opacity, middle depth. A mean depth would lie between two surfaces.
+/// opacity, lower median of the depth. A mean depth would lie between two surfaces.
 fn combine(samples: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
     let [r, g, b] = std::array::from_fn(|c| mean(samples, |(p, _)| p.premultiplied[c]));
     let mut distances: Vec<(f32, f32)> =

@@ -54,9 +54,10 @@ pub(crate) fn comparison(data: Option<&Data>) -> Markup {
                     }
                 }
                 p id="panes-help" class="note" {
-                    "Drag to move the divider, or to pan a zoomed view. Ctrl and wheel, pinch, + "
-                    "and − zoom. 0 fits the view; 1 or a double click shows one image pixel per "
-                    "screen pixel. N and P change the view."
+                    "Drag to move the divider, or to pan a zoomed view. To zoom, pinch, press + or "
+                    "−, or turn the wheel with Ctrl pressed. 0 fits the view; 1 shows one image "
+                    "pixel per screen pixel. A double click acts like 0 in a zoomed view, "
+                    "otherwise like 1. N and P change the view."
                 }
                 div id="scales" {}
                 div class="wide tall low" tabindex="0" role="region" aria-label="Numbers of this view" {

@@ -93,7 +93,7 @@ fn read_rows(file: &Path) -> anyhow::Result<Rows> {
     read().with_context(|| format!("AGAINST = {}", file.display()))
 }
 
-/// Prints this run's values over those of an earlier one.
+/// Prints this run's values next to those of an earlier run, and their ratios.
 fn compare(rows: &Rows, earlier: &Rows) {
     println!("\n{:<52} {:>14} {:>14} {:>7}", "", "earlier", "now", "ratio");
     for row in &earlier.0 {

@@ -33,9 +33,9 @@ pub(crate) fn centre_and_size(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) 
     (centre, (2.0 * quantile(distances, fraction)).max(f64::MIN_POSITIVE))
 }
 
-/// Depth of a drawn frustum over the distance to the nearest camera; chosen by hand.
+/// Depth of a drawn frustum as a fraction of the distance to the nearest camera; chosen by hand.
 const FRUSTUM_SHARE: f64 = 0.4;
-/// Maximum depth of a drawn frustum over the scene's size; chosen by hand.
+/// Maximum depth of a drawn frustum as a fraction of the scene's size; chosen by hand.
 const MAX_FRUSTUM_SHARE: f64 = 0.06;
 
 /// Returns the depth of the drawn frusta in scene units: so small that most don't overlap.

@@ -116,8 +116,8 @@ impl SelectedExperiment<'_> {
         protocols.collect()
     }
 
-    /// Returns the parameters of a protocol: those of its preset over those of `every`. A protocol
-    /// WIDTHxSCALE without a preset has those of `other`, with its width and scale.
+    /// Returns the parameters of a protocol: those of `every`, overridden by the protocol's preset.
+    /// A protocol WIDTHxSCALE without a preset has those of `other`, with its width and scale.
     fn preset(&self, name: &str) -> Result<Map<String, Value>, PlanError> {
         let presets = &self.experiment.presets;
         let own = presets.get(name).filter(|_| is_protocol(name));

@@ -12,7 +12,7 @@ use crate::folder::{ACTIONS, Listing};
 use crate::intake::{Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, parse_record, read_manifest};
 use crate::remote::{Access, Remote};
 use crate::selection::Selection;
-use crate::transfer::{Progress, Transfer, run_all};
+use crate::transfer::{Progress, REMOTE_REMEDY, Transfer, run_all};
 
 /// Copies finished actions and their artifacts from a remote, unless the store has them.
 pub(crate) async fn pull(
@@ -166,7 +166,7 @@ async fn fetch_manifest(
     }
     let file = object_entry(&identity, MANIFEST_FILE);
     let Some(bytes) = remote.read(&file, MAX_MANIFEST_BYTES).await? else {
-        bail_bad_input!("{}: not found; push again from a complete store", remote.name(&file));
+        bail_bad_input!("{}: not found; {REMOTE_REMEDY}", remote.name(&file));
     };
     let manifest = intake.add_manifest(&identity, &bytes, &remote.name(&file))?;
     Ok(Object { identity, records, bytes: Some(manifest.size()) })

@@ -157,8 +157,9 @@ impl Transfer {
 /// Remedy for a damaged artifact of the store.
 pub(crate) const STORE_REMEDY: &str =
     "the artifact is damaged; remove it by `nerf-sr verify --remove`, then run again";
-const REMOTE_REMEDY: &str = "the artifact was not pulled; delete this file and the action's record \
-    on the remote, and push again from a store that has the artifact";
+/// Remedy for a missing or damaged file on the remote. A push skips actions whose record exists.
+pub(crate) const REMOTE_REMEDY: &str = "the artifact was not pulled; on the remote, delete the \
+    action's record, and this file if it exists; then push again from a store with the artifact";
 
 /// Comparison of a file's content with its manifest, piece by piece.
 pub(crate) struct ContentCheck<'a> {

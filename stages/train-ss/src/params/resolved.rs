@@ -13,7 +13,7 @@ const LEARNING_RATE_WARMUP_STEPS: u64 = 100;
 /// Gradient norm, relative to the mean, below which gradients go through Russian roulette (design
 /// note 037).
 const ROULETTE: f32 = 0.25;
-/// Final learning rate of the MLPs over the initial one (NeRF-SR's code).
+/// Ratio of the MLPs' final learning rate to the initial one (NeRF-SR's code).
 #[cfg(feature = "torch")]
 const MLP_LEARNING_RATE_DECAY: f64 = 0.01;
 

@@ -18,7 +18,7 @@ const FULL_SIZE_PROGRESS: f64 = 0.4;
 /// Maximum number of renders per camera and round, enough for two Gauss-Newton steps (design note
 /// 025).
 const MAX_RENDERS_PER_ROUND: u32 = 3;
-/// Number of times that the photographs are halved at first (design note 025).
+/// Maximum number of times that the photographs are halved at first (design note 025).
 const FIRST_HALVINGS: u32 = 3;
 
 /// Cameras that move during training so that the field's renders fit their photographs.

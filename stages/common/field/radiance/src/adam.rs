@@ -21,7 +21,7 @@ impl AdamStep {
     /// the rate. `step` counts from 1.
     pub(crate) fn new(step: u64, rate: f64, decay: f32) -> Self {
         let [beta1, beta2] = ADAM_BETA;
-        // Far beyond this limit, which is chosen by hand, both corrections are 1.
+        // Both corrections are 1 long before this limit, which is chosen by hand.
         let t = step.min(100_000) as i32;
         let corrected = rate * (1.0 - beta2.powi(t)).sqrt() / (1.0 - beta1.powi(t));
         Self {

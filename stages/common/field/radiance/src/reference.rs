@@ -241,9 +241,9 @@ fn fused_passes_equal_the_plain_ones() {
         }
     }
 
-    // The loss is Σ g·C with random g, so that its gradient with respect to the colours is g, plus
-    // the floater loss. The floater loss has no gradient with respect to sample colours and
-    // transmittance: likenesses are computed once and stay constant.
+    // The loss is Σ g·C plus the floater loss; the random g are the gradients with respect to the
+    // rays' colours C. The floater loss has no gradient with respect to sample colours and
+    // transmittance, so likenesses are computed once and stay constant.
     let regularisers = Regularisers { distortion: 0.0, floater_loss: 0.3 };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {

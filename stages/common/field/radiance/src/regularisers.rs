@@ -73,9 +73,9 @@ pub(crate) fn background_likeness(colour: [f32; 3], background: [f32; 3]) -> f32
 }
 
 /// Adds the gradient of the floater loss T·Σ_i w_i·[`background_likeness`]_i with respect to each
-/// weight w_i; `factor` is the loss's weight times T. There is no gradient with respect to the
-/// colours, which would make floaters darker instead of thinner, or to the ray's transmittance T.
-/// The factor T spares opaque surfaces of the background's colour.
+/// weight w_i; `factor` is the loss's weight times T. Gradients with respect to the ray's
+/// transmittance T and to the colours are left out: the latter would recolour floaters instead of
+/// thinning them. The factor T spares opaque surfaces of the background's colour.
 #[inline]
 fn add_floater_gradients(ray: &ShadedRay<'_>, factor: f32, by_weight: &mut [f32]) {
     for (by_weight, colour) in by_weight.iter_mut().zip(ray.colours()) {

@@ -37,8 +37,10 @@ struct AlongRay {
     transmittance: Aligned,
     weight: Aligned,
     t: Aligned,
+    /// Gradient with respect to each sample's weight.
     by_weight: Aligned,
-    by_depth: Aligned,
+    /// Gradient with respect to each sample's optical depth.
+    by_optical_depth: Aligned,
 }
 
 /// Inputs of a backward pass, one entry per ray.
@@ -259,7 +261,7 @@ impl AlongRay {
             &mut self.weight,
             &mut self.t,
             &mut self.by_weight,
-            &mut self.by_depth,
+            &mut self.by_optical_depth,
         ] {
             buffer.grow(longest);
         }
@@ -342,10 +344,10 @@ impl Shading {
                 &along.transmittance[..len],
                 weight,
                 behind,
-                &mut along.by_depth[..len],
+                &mut along.by_optical_depth[..len],
             );
-            for (&k, &by_depth) in indices.iter().zip(&*along.by_depth) {
-                gradients[k as usize][0] = by_depth * counted.outputs[k as usize][0];
+            for (&k, &by_optical_depth) in indices.iter().zip(&*along.by_optical_depth) {
+                gradients[k as usize][0] = by_optical_depth * counted.outputs[k as usize][0];
             }
         }
     }

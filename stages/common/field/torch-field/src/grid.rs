@@ -123,7 +123,8 @@ pub(crate) struct GridForward {
     pub(crate) shaded_ray: Tensor,
     /// Cells in which samples absorb light; only in training.
     pub(crate) hits: Vec<CellHit>,
-    /// Number of samples in occupied cells; only in training.
+    /// Number of samples that the hand-written field evaluates ([`count_marched`]); only in
+    /// training.
     pub(crate) samples: usize,
     maps: RayTensors,
 }
@@ -224,8 +225,8 @@ fn optical_depths(
     Ok([through, transmittance, weights])
 }
 
-/// Counts the samples that a training step evaluates. A ray's samples in `kept` are evaluated in
-/// rounds ([`TRAINING_ROUND_SAMPLES`]), until its optical depth reaches [`MAX_OPTICAL_DEPTH`].
+/// Counts the samples in `kept` that a training step of the hand-written field evaluates: in rounds
+/// ([`TRAINING_ROUND_SAMPLES`]), until a ray's optical depth reaches [`MAX_OPTICAL_DEPTH`].
 /// `through` is the optical depth up to each step's end.
 fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
     let exists = through.f_zeros_like()?.f_reshape([-1])?.f_index_fill(0, kept, 1.0)?;
@@ -347,11 +348,11 @@ impl TorchGrid {
                 .f_gt(f64::from(MIN_TRANSMITTANCE))?
                 .f_logical_and(&weights.f_gt(f64::from(MIN_WEIGHT))?)
         })?;
-        let counts = counted.f_reshape([-1])?.f_index_select(0, &kept)?;
-        let tau = tau.f_where_self(&counts, &tau.f_detach()?)?;
+        let is_counted = counted.f_reshape([-1])?.f_index_select(0, &kept)?;
+        let tau = tau.f_where_self(&is_counted, &tau.f_detach()?)?;
         let [through, _, weights] = optical_depths(&tau, &kept, n, count)?;
 
-        let shaded = counts.f_nonzero()?.f_squeeze_dim(-1)?;
+        let shaded = is_counted.f_nonzero()?.f_squeeze_dim(-1)?;
         let step = kept.f_index_select(0, &shaded)?;
         let ray = step.f_div_scalar_mode(count, "floor")?;
         let weight = weights.f_reshape([-1])?.f_index_select(0, &step)?.f_unsqueeze(-1)?;
@@ -446,7 +447,8 @@ impl TorchGrid {
         self.cells.f_take(&cell)?.f_to_kind(Kind::Float)
     }
 
-    /// Renders colour, opacity and depth of each ray, in pieces as large as memory allows.
+    /// Renders colour, opacity and depth of each ray in pieces, which get smaller after running out
+    /// of memory.
     pub fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TorchFieldError> {
         const MIN_RAYS: usize = 64;
         let size = if self.device == Device::Cpu { 1 << 10 } else { 1 << 15 };

@@ -312,7 +312,7 @@ fn lazy_adam(
     gradient: &Tensor,
     [mut first, mut second]: [Tensor; 2],
 ) -> Result<(), TchError> {
-    // The same limit as in `radiance`'s Adam: far beyond it, both corrections are 1.
+    // The same limit as in `radiance`'s Adam: both corrections are 1 long before this limit.
     let t = t.min(100_000) as i32;
     let rate = learning_rate * (1.0 - ADAM_BETA[1].powi(t)).sqrt() / (1.0 - ADAM_BETA[0].powi(t));
     let touched = gradient.f_ne(0.0)?;

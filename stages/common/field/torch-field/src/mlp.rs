@@ -306,7 +306,8 @@ impl Mlp {
     }
 
     /// Renders colour, opacity and depth of each ray. The CPU renders in parallel, with results
-    /// independent of the number of threads; a GPU renders pieces as large as its memory allows.
+    /// independent of the number of threads. A GPU renders pieces, which get smaller after running
+    /// out of memory.
     pub fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TorchFieldError> {
         const CPU_RAYS: usize = 32;
         const GPU_RAYS: usize = 1 << 14;

@@ -13,8 +13,8 @@ pub(crate) struct RayTensors {
     /// Parameters t at which rays enter and leave the cube (n × 1 each), equal if they miss it.
     pub(crate) enter: Tensor,
     pub(crate) leave: Tensor,
-    /// Coefficients of the map from t to distance (n × 1 each): start, scale, then perspective and
-    /// end or, in a contraction, radii, which positions need, too, and 0.
+    /// Coefficients of the map from t to distance (n × 1 each): start, scale, perspective and end.
+    /// In a contraction: start, scale, radii, which only positions need, and 0.
     distance: Vec<Tensor>,
     is_contracted: bool,
 }

@@ -11,8 +11,8 @@ use crate::find_format;
 use crate::format::Format;
 use crate::photograph::is_image_name;
 
-/// Maximum number of folders two levels below that are searched: a home folder may have many.
-/// Chosen by hand.
+/// Maximum number of folders that are searched on the second level below a folder, and on the
+/// third: a home folder may have many. Chosen by hand.
 const MAX_FOLDERS: usize = 1000;
 /// Maximum number of data sets that a message lists.
 const MAX_LISTED: usize = 3;

@@ -146,8 +146,8 @@ impl Intrinsics {
         )
     }
 
-    /// Returns the mask of pixels with valid rays; `None` if all are valid. A cut ray (see
-    /// [`Intrinsics::is_clamped`]) is not valid.
+    /// Returns the mask of pixels with valid rays; `None` if all are valid. A clamped ray
+    /// (see [`Intrinsics::is_clamped`]) is not valid.
     pub fn lens_mask(&self) -> Option<Mask> {
         if !self.has_clamped_rays() {
             return None;

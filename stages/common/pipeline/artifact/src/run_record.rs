@@ -218,8 +218,8 @@ impl RunRecord {
     }
 
     /// Returns the nodes of training and of rendering among a node and its ancestors, sorted.
-    /// Training has the fields and refiners, and the views that one of them depends on. All other
-    /// views are rendering, refined views included.
+    /// Nodes of training are the fields and refiners, and the views that one of them depends on.
+    /// Nodes of rendering are all other views, refined ones included.
     pub fn training_and_rendering(&self, node: usize) -> [Vec<usize>; 2] {
         let mut trained = self.ancestors(node);
         trained.retain(|&i| ["field", "refiner"].contains(&self.nodes[i].kind.as_str()));
@@ -271,8 +271,8 @@ mod tests {
         assert_eq!(sink_folders(&[&nodes[0]]), [""]);
     }
 
-    /// Renders of references are rendering, although their inputs aren't the scored views. Views
-    /// that a refiner was trained on are training.
+    /// Renders of references count as rendering, although they aren't the scored views. Views that
+    /// a refiner was trained on count as training.
     #[test]
     fn views_for_a_training_are_training() {
         let node = |stage: &str, kind: &str, inputs: &[(&str, usize)]| {

@@ -60,8 +60,8 @@ pub fn emit() {
     println!("cargo:rustc-env=STAGE_FINGERPRINT={}", hash.0.finalize().to_hex());
 }
 
-/// Hashes the sources of a crate and of the workspace crates that it depends on, the profiles, and
-/// their locked packages. Returns the folders of the crates.
+/// Hashes the profiles, and the manifests, sources and locked packages of a crate and of the
+/// workspace crates that it depends on. Returns the folders of these crates.
 fn add_sources(hash: &mut Hash, root: &Path, crate_dir: &Path) -> Vec<PathBuf> {
     let workspace = read_toml(&root.join("Cargo.toml"));
     let profile = workspace.get("profile").map(ToString::to_string).unwrap_or_default();

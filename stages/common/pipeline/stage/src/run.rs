@@ -211,7 +211,8 @@ impl Program {
             Some(n) => n,
             None => processors().count,
         };
-        // Inputs are opened in parallel: without a pool, rayon would start one of its own size.
+        // An input's files are hashed in parallel. Without this pool, rayon would start one with
+        // its default number of threads.
         start_threads(threads);
         let mut inputs = BTreeMap::new();
         for (name, folder) in folders {

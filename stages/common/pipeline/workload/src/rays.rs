@@ -1,7 +1,7 @@
 use serde::Deserialize;
 
-/// Rays of a fine-tuning over those of the initial field, as in the protocols with an LR width
-/// (`experiments/common.yaml`).
+/// Ratio of a fine-tuning's rays to the initial field's, as in the named protocols of
+/// `experiments/common.yaml`.
 const FINE_TUNING_RAY_FACTOR: f64 = 0.5;
 
 /// Parameters that determine the number of a training's rays. Deserialised from the parameters of
@@ -12,7 +12,7 @@ pub struct RayBudget {
     pub rays: Option<u64>,
     /// Rays for each LR pixel of all views.
     pub rays_per_pixel: f64,
-    /// Rays per LR pixel of an opaque scene over those of other scenes.
+    /// Ratio of the rays per LR pixel of an opaque scene to those of other scenes.
     pub opaque_ray_factor: f64,
     /// Minimum number of rays, which a fine-tuning halves.
     pub min_rays: u64,

@@ -87,7 +87,7 @@ impl TrainingMemory {
 
 /// Returns the bytes that a training needs besides field, poses and pixels, with or without
 /// libtorch: for the program, the samples of a step and a checkpoint's file. Measured with small
-/// scenes, and without libtorch with the demo scene; the command isn't recorded.
+/// scenes; without libtorch, the demo scene was measured, too. The command isn't recorded.
 pub const fn program_bytes(has_torch: bool) -> u64 {
     if has_torch { 175_000_000 } else { 60_000_000 }
 }

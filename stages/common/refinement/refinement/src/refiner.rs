@@ -72,8 +72,8 @@ pub struct RefinerFile {
     pub rendered_psnr: f64,
     /// Mean PSNR of the refined validation views, in dB.
     pub refined_psnr: f64,
-    /// Sum of the confidence over the sum of the visibility of references in the validation views:
-    /// 1 if references agree with renders. Absent if the network takes no references.
+    /// Ratio of the summed confidence to the summed visibility of references in the validation
+    /// views: 1 if references agree with renders. Absent if the network takes no references.
     #[serde(default)]
     pub confidence: Option<f64>,
     /// True if the network's input views are made consistent with their own LR photographs.

@@ -25,8 +25,9 @@ pub struct Rendered {
 }
 
 impl Rendered {
-    /// Converts a view's image, composited on a grey background. Fails if the image has no depth
-    /// and `needs_depth` is true.
+    /// Converts a view's image, and composites the colours on the grey level `background`. Fails if
+    /// the image's size isn't the camera's, or if colour, opacity or, with `needs_depth`, depth is
+    /// missing.
     pub fn new(
         camera: Camera,
         image: &ExrImage,
@@ -62,8 +63,8 @@ impl Rendered {
         Ok(Self { opacity, depth, view, camera })
     }
 
-    /// Reads a view of an input, composited on a grey background, together with its file's
-    /// channels, as [`Rendered::new`]. Returns `None` if the view has no image.
+    /// Reads a view's image from an input. Returns the rendered view ([`Rendered::new`]) and the
+    /// image; `None` if the view has no image.
     ///
     /// # Errors
     /// [`Failure::BadInput`], with input and view, if the image can't be read or isn't that of a

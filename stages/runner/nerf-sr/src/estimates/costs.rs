@@ -248,8 +248,8 @@ fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     Some((seconds, rendering_memory(work)? + bytes))
 }
 
-/// Returns this machine's time for the work of [`SpeedTest`] over the reference machine's time. The
-/// first call measures the machine.
+/// Returns the ratio of this machine's time for the work of [`SpeedTest`] to the reference
+/// machine's time. The first call measures the machine.
 pub(crate) fn slowness() -> f64 {
     static SLOWNESS: OnceLock<f64> = OnceLock::new();
     *SLOWNESS.get_or_init(measure)

@@ -73,8 +73,8 @@ impl Work {
         Some(sizes.for_scene(self.pixels_across, self.kind == SceneKind::Frustum))
     }
 
-    /// Returns the number of a field's cells per LR pixel, by area, over the default number. The
-    /// ratio is at most 1; parameters and the maximum resolution can make it smaller.
+    /// Returns the ratio of a field's number of cells per LR pixel, by area, to the default number.
+    /// The ratio is at most 1; parameters and the maximum resolution can make the ratio smaller.
     pub(crate) fn resolved_part(&self, training: &Value) -> Option<f64> {
         let default = radiance::CELLS_PER_PIXEL * self.pixels_across.max(1.0);
         let resolution = f64::from(self.architecture(training)?.max_resolution);

@@ -57,8 +57,9 @@ impl RayKind for Curved {
             let cube = EmptyCube::around(lane_of(&lane_positions.cells, i), log2_sides[i]);
             let inside =
                 cube.time_inside(&lane_of(&lane_positions.positions, i), &lane_of(&velocities, i));
-            // For a cube of one cell, t itself, a valid bound: the ray advances by a step anyway,
-            // and half a cell, the mean distance ahead, is about one step (at 512 `march_steps`).
+            // For a cube of one cell, t itself is the bound. A closer bound would gain little: the
+            // ray advances by a step anyway, and the mean distance to the exit, half a cell, is
+            // about one step (at 512 `march_steps`).
             exits[i] =
                 if log2_sides[i] == 0 { lane_positions.t[i] } else { inside + lane_positions.t[i] };
         }

@@ -40,7 +40,8 @@ impl Tolerance {
 /// Extensions that a file may have instead of the listed one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Extensions {
-    /// An image extension more, one of two less, or another instead of an unsupported format's.
+    /// The listed name with an image extension added, the second of two removed, or an unsupported
+    /// format's replaced.
     Similar,
     /// Any image extension: reduced copies often have another format.
     Any,

@@ -53,8 +53,9 @@ impl Schema {
         names
     }
 
-    /// Converts a parameter's value to the form that is hashed: numbers in the form of their type,
-    /// so that 2, 2.0 and 2e0 are equal, and a value that equals the default written like it.
+    /// Converts a parameter's value to the form that is hashed. Numbers have the form of their
+    /// type, so that 2, 2.0 and 2e0 are equal. A value equal to the default is written as in the
+    /// schema.
     pub fn canonical_value(&self, name: &str, value: &Value) -> Value {
         let variant = self.variants.iter().find(|variant| variant.property(name).is_some());
         variant.map_or_else(|| value.clone(), |variant| variant.canonical_value(name, value))

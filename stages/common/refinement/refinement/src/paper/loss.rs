@@ -4,8 +4,9 @@ use crate::RefinementError;
 use nets::{Conv, Weights};
 use tch::{Kind, TchError, Tensor};
 
-/// The paper's perceptual loss: the weighted mean absolute differences of VGG-19's features after
-/// the second ReLU of each block, for the blocks whose weights are in the file.
+/// The paper's perceptual loss: a weighted sum over VGG-19's blocks. A block's term is the mean
+/// absolute difference of the features after its second ReLU. Blocks whose weights aren't in the
+/// file are left out.
 ///
 /// Two kinds of files are supported: torchvision's (`features.N.weight`), and Caffe's
 /// (`convB_N.weight`). Features in Caffe's scaling are hundreds of times larger, so each layer's

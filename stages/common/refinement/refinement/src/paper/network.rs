@@ -35,9 +35,9 @@ const ENCODER: [LayerSpec; 7] = [
     (Some(4), Some(4), 1, true),
     (Some(4), Some(4), 2, true),
 ];
-/// Three layers per size, coarsest first. The first one takes the previous size's output, the
-/// view's features, and their maximum over references: 4 + 4, 4 + 4 + 4, 2 + 2 + 2, 1 + 1 + 1
-/// widths.
+/// Three layers per size, coarsest size first. The first layer of a size takes the previous size's
+/// output, the view's features, and the maximum of the references' features. The inputs are 4 + 4
+/// widths (the coarsest size has no previous one), 4 + 4 + 4, 2 + 2 + 2 and 1 + 1 + 1.
 const DECODER: [LayerSpec; 12] = [
     (Some(8), Some(4), 1, true),
     (Some(4), Some(4), 1, true),

@@ -21,14 +21,14 @@ type Corner = (usize, usize);
 
 impl PaperRefiner {
     /// Redraws a view in patches of 64×64 pixels, blended where they overlap. Each patch gets at
-    /// most `max_references` reference patches, at positions where the patch's pixels are visible
+    /// most `max_patches` reference patches, at positions where the patch's pixels are visible
     /// in the references. A patch without reference patches is its own reference, as in the paper's
     /// code. Returns an image of three channels in 0..1.
     pub fn refine(
         &self,
         rendered: &Rendered,
         references: &[&KnownView],
-        max_references: usize,
+        max_patches: usize,
     ) -> Result<Image, RefinementError> {
         let view = &rendered.view;
         check_size(&rendered.camera.name, "the rendered view", view)?;
@@ -43,22 +43,22 @@ impl PaperRefiner {
             .collect();
         let patches = tasks
             .into_par_iter()
-            .map(|(corner, network)| network.redraw(rendered, corner, references, max_references))
+            .map(|(corner, network)| network.redraw(rendered, corner, references, max_patches))
             .collect::<Result<Vec<_>, _>>()?;
         Ok(blend(view.width, view.height, &patches))
     }
 
-    /// Redraws a view's patch with at most `max_references` reference patches, in -1..1.
+    /// Redraws a view's patch with at most `max_patches` reference patches, in -1..1.
     fn redraw(
         &self,
         rendered: &Rendered,
         corner: Corner,
         references: &[&KnownView],
-        max_references: usize,
+        max_patches: usize,
     ) -> Result<(Corner, Vec<f32>), TchError> {
         let samples = patch(&rendered.view, corner);
         let mut reference_samples: Vec<Vec<f32>> =
-            matching_patches(rendered, references, corner, max_references)
+            matching_patches(rendered, references, corner, max_patches)
                 .into_iter()
                 .map(|(r, corner)| patch(&references[r].truth, corner))
                 .collect();
@@ -106,14 +106,14 @@ pub(crate) fn patch(image: &Image, (x, y): Corner) -> Vec<f32> {
     samples
 }
 
-/// Finds at most `max_count` reference patches that display the surface in a view's patch, the most
-/// visible first. Returns the index of the reference and the corner of each. Each probe that is
-/// visible in a reference yields one candidate; duplicates are dropped.
+/// Finds at most `max_patches` reference patches that display the surface in a view's patch, the
+/// most visible first. Returns the index of the reference and the corner of each. Each probe that
+/// is visible in a reference yields one candidate; duplicates are dropped.
 fn matching_patches(
     rendered: &Rendered,
     references: &[&KnownView],
     (x, y): Corner,
-    max_count: usize,
+    max_patches: usize,
 ) -> Vec<(usize, Corner)> {
     let surface = rendered.surface();
     let surfaces: Vec<SurfaceMap<'_>> = references.iter().map(|r| r.rendered.surface()).collect();
@@ -139,7 +139,7 @@ fn matching_patches(
         .into_iter()
         .map(|(_, r, corner)| (r, corner))
         .filter(|patch| taken.insert(*patch))
-        .take(max_count)
+        .take(max_patches)
         .collect()
 }
 

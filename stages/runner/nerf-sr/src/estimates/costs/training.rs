@@ -33,7 +33,7 @@ const UNBOUNDED: TrainingCosts =
 /// time at half of either (docs/design/008).
 const STEPS_EXPONENT: f64 = 0.8;
 const HIDDEN_EXPONENT: f64 = 0.55;
-/// Mean number of samples of a step over `samples_per_step`: steps grow to 8/3 times as many.
+/// Ratio of a step's mean number of samples to `samples_per_step`: steps grow to 8/3 times as many.
 const STEP_GROWTH: f64 = 2.0;
 /// Extra cost of the first steps with the default `samples_per_step`, as a number of rays late in a
 /// training (docs/design/048).
@@ -48,7 +48,7 @@ const MLP_RAY_SECONDS: f64 = 5.4e-3;
 /// Minimum bytes of the paper's field, as in `train-ss`.
 const MLP_BYTES: u64 = 500_000_000;
 
-/// Returns the factors of a ray's samples and of a sample's cost over those of a field with the
+/// Returns the ratios of a ray's samples and of a sample's cost to those of a field with the
 /// default sizes.
 fn field_factors(field: &Value, kind: SceneKind) -> Option<(f64, f64)> {
     let by_default = GivenSizes {
@@ -66,7 +66,7 @@ fn field_factors(field: &Value, kind: SceneKind) -> Option<(f64, f64)> {
     Some((steps.powf(STEPS_EXPONENT), hidden.powf(HIDDEN_EXPONENT)))
 }
 
-/// Returns the factor of a ray's cost over that of a field with the default sizes.
+/// Returns the ratio of a ray's cost to that of a field with the default sizes.
 pub(super) fn field_factor(field: &Value, kind: SceneKind) -> Option<f64> {
     let (samples, sample) = field_factors(field, kind)?;
     Some(samples * sample)
