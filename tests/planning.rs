@@ -295,18 +295,20 @@ fn times_are_estimated_before_a_run() {
     assert!(project.ok(&["advise"]).trim_end().ends_with("-p quality=balanced"));
 }
 
-/// Before `prep` has run, estimates look at the borders of three photographs. After it, they and the
-/// run's records have the scene's own background, here of photographs that deceive.
+/// Before `prep` has run, estimates look at cameras and at the borders of three photographs. After
+/// it, they and the run's records have the scene's own background, here of photographs that
+/// deceive.
 #[test]
 fn estimates_follow_the_photographs() {
     let project = Project::tiny();
-    for (name, backdrop, kind) in [
-        ("white", false, "object in front of a plain background"),
-        ("yard", true, "opaque scene around the cameras"),
+    for (name, backdrop, layout, kind) in [
+        ("white", false, "around", "object in front of a plain background"),
+        ("wall", true, "forward", "opaque scene, photographed from one side"),
+        ("yard", true, "around", "opaque scene around the cameras"),
     ] {
         let parameters = json!({
-            "form": "transforms", "backdrop": backdrop, "size": 32, "train": 9, "test": 1,
-            "samples_per_axis": 1,
+            "form": "transforms", "backdrop": backdrop, "layout": layout, "size": 32, "train": 9,
+            "test": 1, "samples_per_axis": 1,
         });
         let made = stage("demo-scene", &parameters.to_string(), &[], &project.path(name), &[]);
         assert_eq!(made.code, 0, "{}", made.stderr);

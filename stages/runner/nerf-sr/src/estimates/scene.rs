@@ -4,9 +4,9 @@ use std::cell::OnceCell;
 use std::path::Path;
 
 use artifact::format_count;
-use dataset::{Border, Dataset, Format, Split};
+use dataset::{Border, Dataset, Frame, Split};
 use pixels::{DEGRADATION_FILE, Filter, Kernel};
-use scene::{Background, Intrinsics, Space, VIEWS_FILE, Views};
+use scene::{Background, Camera, Intrinsics, Space, VIEWS_FILE, Views, common_direction};
 use serde::Deserialize;
 use serde_json::Value;
 use store::SceneKind;
@@ -128,7 +128,7 @@ impl SceneImages {
             (_, Some(split)) => split.clone(),
         };
         let space = parameters["space"].as_str();
-        let is_ndc = space.map_or(set.format == Format::Llff, |space| space == "ndc");
+        let is_ndc = space.map_or_else(|| faces_one_direction(set), |space| space == "ndc");
         let planned = PlannedScene {
             kind: kind_of(is_opaque, is_ndc),
             sizes: set.frames.iter().map(|frame| size_of(frame.intrinsics())).collect(),
@@ -240,6 +240,13 @@ impl SceneImages {
     pub(crate) fn images(&self, folder: &str) -> Option<Images> {
         self.folders.iter().find(|(name, _)| *name == folder).map(|(_, images)| *images)
     }
+}
+
+/// Returns whether `prep` may represent an opaque scene in NDC.
+fn faces_one_direction(set: &Dataset) -> bool {
+    let cameras: Vec<Camera> = set.frames.iter().map(Frame::camera).collect();
+    common_direction(cameras.iter()).is_some()
+        && !cameras.iter().any(|camera| camera.intrinsics.distortion.is_fisheye())
 }
 
 fn kind_of(is_opaque: bool, is_ndc: bool) -> SceneKind {
