@@ -333,6 +333,8 @@ fn estimates_follow_the_photographs() {
     let trainings: Vec<Value> = records.filter(|record| record["stage"] == "train-ss").collect();
     assert_eq!(trainings.len(), 1);
     assert_eq!(trainings[0]["model"]["scene"], "unbounded", "{}", trainings[0]);
+    let advice = project.ok(&[&["advise", "-p", "lr_width=12"], &dataset[..]].concat());
+    assert!(advice.contains("opaque scene around the cameras"), "{advice}");
 }
 
 /// Estimates for a camera path use the number and size of frames in its parameters or its file.

@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use slurm::Job;
 use store::{Record, Store, StoreError};
 
-use crate::estimates::Estimates;
+use crate::estimates::{Datasets, Estimates, Estimator};
 
 /// A plan with the states of its nodes.
 pub(crate) struct Planned<'a> {
@@ -21,8 +21,9 @@ pub(crate) struct Planned<'a> {
 
 impl Planned<'_> {
     /// Estimates the nodes that aren't cached.
-    pub(crate) fn estimates(&self) -> Estimates {
-        Estimates::new(&self.plan, &self.states, self.store)
+    pub(crate) fn estimates(&self, datasets: &mut Datasets) -> Estimates {
+        let estimator = Estimator::new(&self.plan, &self.states, self.store, datasets);
+        estimator.estimates(&self.states)
     }
 
     /// Finds the nodes that will run and on which a waiting node depends, directly or not.

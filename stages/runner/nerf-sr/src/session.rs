@@ -11,7 +11,6 @@ use slurm::{Job, Queue, Slurm};
 use stage::check_device;
 use store::{RunFile, Store};
 
-use crate::estimates::Estimates;
 use crate::planned::Planned;
 
 /// Pipeline, store and devices of a verb.
@@ -101,13 +100,13 @@ impl Session {
 #[derive(Clone, Copy)]
 pub(crate) struct Run<'a> {
     pub(crate) plan: &'a Plan,
+    /// States of the nodes at the run's start; empty if an input can't be read.
+    pub(crate) states: &'a [State],
     pub(crate) store: &'a Store,
     /// File of the actions that the run needs, which protects them from garbage collection.
     pub(crate) file: &'a RunFile,
     /// Folder of pages.
     pub(crate) out: &'a Path,
-    /// Expected costs of the nodes, as far as known.
-    pub(crate) estimates: &'a Estimates,
     pub(crate) stop: &'a AtomicBool,
 }
 

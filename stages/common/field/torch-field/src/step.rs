@@ -18,7 +18,7 @@ pub(crate) fn learning_rate(highest: f64, decay: f64, epochs: u64, done: f64) ->
     let epoch = ((done * epochs as f64) as u64).min(epochs - 1);
     let progress =
         (epoch + 1 + FALLING_EPOCHS).saturating_sub(epochs) as f64 / (FALLING_EPOCHS + 1) as f64;
-    highest * decay.powf(progress)
+    highest * libm::pow(decay, progress)
 }
 
 /// Loss of some of a step's bundles.

@@ -76,14 +76,18 @@ const REFINED_PIXEL_SECONDS: f64 = 0.47e-6;
 /// number of references: 1 to 8 references of fern.
 const REFERENCE_SHARE: f64 = 0.36;
 const REFERENCES_EXPONENT: f64 = 0.68;
-/// Seconds per pixel of a refined view and per reference: fern.
+/// Seconds per pixel of a refined view and per reference, and bytes per pixel of a view that is
+/// refined with references, in all and per reference: fern.
 const WARPED_PIXEL_SECONDS: f64 = 1.25e-6;
-/// Bytes per pixel of a network's training views, of its patches without and with references, and
-/// of a view that is refined.
+const WARPED_PIXEL_BYTES: u64 = 150;
+const REFERENCE_PIXEL_BYTES: u64 = 25;
+/// Bytes per pixel of a network's training views, of its patches, and of a view that is refined.
 const EXAMPLE_PIXEL_BYTES: u64 = 43;
 const PATCH_PIXEL_BYTES: u64 = 1_740;
-const WARPED_PATCH_PIXEL_BYTES: u64 = 5_700;
 const REFINED_PIXEL_BYTES: u64 = 128;
+/// Bytes of all warped references in a refiner's training, per pixel of the largest view: lego and
+/// fern. They don't depend on the number of references.
+const WARPED_VIEWS_BYTES: u64 = 3_000;
 /// Seconds of a start of a stage; chosen by hand.
 const START_SECONDS: f64 = 0.3;
 /// Seconds of `demo-scene`: per pixel, for the image file; per ray, without and with a backdrop.
@@ -213,21 +217,30 @@ fn refiner_training(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
         return None;
     }
     let patches = number(parameters, "patch_size")?.powi(2) * number(parameters, "batch_size")?;
-    let references = work.references.count as f64;
-    let (share, patch_bytes) = match work.references.count {
-        0 => (0.0, PATCH_PIXEL_BYTES),
-        _ => (REFERENCE_SHARE * references.powf(REFERENCES_EXPONENT), WARPED_PATCH_PIXEL_BYTES),
-    };
+    let references = number(parameters, "references_per_view")?;
+    let share = REFERENCE_SHARE * references.powf(REFERENCES_EXPONENT);
     let seconds = number(parameters, "steps")? * patches * PATCH_PIXEL_SECONDS * (1.0 + share);
-    let bytes = EXAMPLE_PIXEL_BYTES * work.images.pixels + patch_bytes * patches as u64;
+    let warped = if references > 0.0 { WARPED_VIEWS_BYTES } else { 0 };
+    let bytes = EXAMPLE_PIXEL_BYTES * work.images.pixels
+        + PATCH_PIXEL_BYTES * patches as u64
+        + warped * work.images.largest_pixels();
     Some((seconds, torch_program_bytes(work) + bytes))
 }
 
 fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let versions = number(parameters, "self_ensemble")? * REFINED_PIXEL_SECONDS;
-    let references = work.references.count as f64 * WARPED_PIXEL_SECONDS;
-    let seconds = (versions + references) * work.images.pixels as f64;
-    Some((seconds, torch_program_bytes(work) + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
+    let references = match &work.refiner {
+        Some(refiner) if refiner["net"] != "compact" => return None,
+        Some(refiner) if refiner["references_per_view"] == 0 => 0,
+        _ => work.references.count,
+    };
+    let seconds = versions + references as f64 * WARPED_PIXEL_SECONDS;
+    let mut pixel_bytes = REFINED_PIXEL_BYTES + REFERENCE_PIXEL_BYTES * references;
+    if references > 0 {
+        pixel_bytes += WARPED_PIXEL_BYTES;
+    }
+    let memory = torch_program_bytes(work) + pixel_bytes * work.images.largest_pixels();
+    Some((seconds * work.images.pixels as f64, memory))
 }
 
 /// Returns the cost of an export. The time is that of rendering a field with the default sizes. The
@@ -272,10 +285,9 @@ fn measure() -> f64 {
 #[cfg(test)]
 mod tests {
     use serde_json::json;
-
-    use super::super::scene::SceneImages;
     use store::SceneKind;
 
+    use super::super::scene::SceneImages;
     use super::super::work::Images;
     use super::*;
 
@@ -288,6 +300,7 @@ mod tests {
             has_box_kernel: false,
             images,
             references: Images::default(),
+            refiner: None,
             preparation_bytes: 0,
             field: Some(training(1)),
             is_fine_tuning: false,
@@ -369,10 +382,19 @@ mod tests {
         let views = |kind, count| work(kind, count, 200);
         let refiner = json!({
             "net": "compact", "patch_size": 64, "batch_size": 8, "steps": 3500, "self_ensemble": 2,
+            "references_per_view": 0,
         });
+        let mut by_eight = refiner.clone();
+        by_eight["references_per_view"] = json!(8);
         let references = Images { count: 8, ..Images::default() };
-        let referenced = Work { references, ..work(opaque, 20, 218) };
-        let referenced_views = Work { references, ..work(opaque, 12, 873) };
+        let referenced = Work { references, ..work(opaque, 12, 873) };
+        let unused = Work { refiner: Some(refiner.clone()), ..referenced.clone() };
+        // A draft's field and rendering.
+        let mut field = training(1);
+        field["cells_per_pixel"] = json!(1.28);
+        field["hidden_dim"] = json!(32);
+        let draft = |work| Work { field: Some(field.clone()), ..work };
+        let (lego_draft, fern_draft) = (draft(views(object, 12)), draft(work(opaque, 3, 436)));
         for (name, program, parameters, work, seconds) in [
             ("lego, rendered", "render-depth", rendering(2), &views(object, 12), 3.4),
             ("lego 200×4, one ray", "render-depth", rendering(1), &work(object, 50, 800), 44.7),
@@ -381,9 +403,12 @@ mod tests {
             ("fern 252×2", "render-depth", rendering(2), &work(opaque, 3, 436), 6.9),
             ("fern 252×4, one ray", "render-depth", rendering(1), &work(opaque, 19, 873), 65.6),
             ("lego, refiner", "train-refine", refiner.clone(), &lego, 122.4),
-            ("fern, refiner by 8 references", "train-refine", refiner.clone(), &referenced, 315.8),
+            ("fern, refiner by 8", "train-refine", by_eight, &work(opaque, 20, 218), 315.8),
             ("fern, refined", "refine", refiner.clone(), &work(opaque, 12, 873), 10.6),
-            ("fern, refined by 8 references", "refine", refiner, &referenced_views, 105.5),
+            ("fern, refined by 8 references", "refine", refiner.clone(), &referenced, 105.5),
+            ("fern, references unused", "refine", refiner, &unused, 10.6),
+            ("lego, draft", "render-depth", rendering(1), &lego_draft, 1.1),
+            ("fern, draft", "render-depth", rendering(1), &fern_draft, 2.7),
         ] {
             check_time(name, program, &parameters, work, seconds);
         }
@@ -432,9 +457,13 @@ mod tests {
         let demo_200 = Work { pixels_across: 100.0, ..demo_200 };
         let refiner = json!({
             "net": "compact", "patch_size": 64, "batch_size": 8, "steps": 1, "self_ensemble": 1,
+            "references_per_view": 0,
         });
-        let references = Images { count: 1, ..Images::default() };
-        let referenced = Work { references, ..work(opaque, 20, 218) };
+        let mut referenced = refiner.clone();
+        referenced["references_per_view"] = json!(1);
+        let references = |count| Images { count, ..Images::default() };
+        let [by_one, by_eight] =
+            [1, 8].map(|count| Work { references: references(count), ..work(opaque, 12, 873) });
         let render = json!({"samples_per_axis": 1, "tolerance": 0.0025});
         let (train, render_demo) = (training(12_000_000), render.clone());
         for (name, program, parameters, work, measured) in [
@@ -451,7 +480,9 @@ mod tests {
             ("lego 800, refined", "refine", refiner.clone(), &lego, 202.0),
             ("lego 200, refiner", "train-refine", refiner.clone(), &work(object, 100, 200), 350.0),
             ("lego 100, refiner", "train-refine", refiner.clone(), &work(object, 100, 100), 220.0),
-            ("fern, refiner by a reference", "train-refine", refiner, &referenced, 366.0),
+            ("fern, refiner by one", "train-refine", referenced, &work(opaque, 20, 218), 366.0),
+            ("fern, refined by one", "refine", refiner.clone(), &by_one, 402.0),
+            ("fern, refined by 8", "refine", refiner, &by_eight, 493.0),
             ("fern, prepared", "prep", json!({}), &photographs(158_000_000), 205.0),
             ("lego, prepared", "prep", json!({}), &photographs(8_960_000), 19.8),
             ("demo 200, prepared", "prep", json!({}), &photographs(800_000), 9.2),

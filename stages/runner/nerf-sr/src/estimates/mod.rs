@@ -23,7 +23,8 @@ use store::{ModelCost, Record, Store, host_name};
 pub(crate) use text::{check_memory, comparison_text, run_text, total_comparison_text};
 
 use costs::{min_memory, model_cost, slowness};
-use scene::{PlannedDataset, SceneImages, computed_frames, recorded_frames};
+pub(crate) use scene::Datasets;
+use scene::{SceneImages, computed_frames, recorded_frames};
 use work::{Images, Work};
 
 /// Minimum processor seconds of an earlier run that corrects an estimate, and maximum factor
@@ -59,30 +60,8 @@ pub(crate) struct Estimates {
     pub(crate) scenes: Vec<String>,
 }
 
-impl Estimates {
-    /// Estimates the nodes of a plan.
-    pub(crate) fn new(plan: &Plan, states: &[State], store: &Store) -> Self {
-        let is_cached = |state: &State| matches!(state, State::Cached(_));
-        if states.iter().all(is_cached) {
-            // A run with nothing to do reads nothing.
-            return Self::default();
-        }
-        let estimator = Estimator::new(plan, states, store);
-        let missing = states.iter().enumerate().filter(|(_, state)| !is_cached(state));
-        let nodes: BTreeMap<usize, Estimate> = missing
-            .clone()
-            .filter_map(|(index, state)| {
-                Some((index, estimator.estimate(&plan.nodes[index], state)?))
-            })
-            .collect();
-        let unknown = missing.count() - nodes.len();
-        let scenes = estimator.scenes.values().map(SceneImages::summary).collect();
-        Self { nodes, unknown, scenes }
-    }
-}
-
-/// Data that estimates are computed from.
-struct Estimator<'a> {
+/// Estimates nodes of a plan.
+pub(crate) struct Estimator<'a> {
     plan: &'a Plan,
     /// Images by index of the node of `prep`.
     scenes: BTreeMap<usize, SceneImages>,
@@ -93,30 +72,71 @@ struct Estimator<'a> {
 }
 
 impl<'a> Estimator<'a> {
-    fn new(plan: &'a Plan, states: &[State], store: &Store) -> Self {
-        let mut scenes = BTreeMap::new();
-        let mut datasets = BTreeMap::new();
+    /// Reads what estimates depend on: scenes and earlier runs. If all nodes are cached, nothing is
+    /// read. `datasets` keeps data sets for other plans.
+    pub(crate) fn new(
+        plan: &'a Plan,
+        states: &[State],
+        store: &Store,
+        datasets: &mut Datasets,
+    ) -> Self {
+        let threads = stage::processors().count as u64;
+        let mut estimator = Self { plan, scenes: BTreeMap::new(), records: Vec::new(), threads };
+        if states.iter().all(is_cached) {
+            return estimator;
+        }
         for (index, node) in plan.nodes.iter().enumerate() {
-            if node.program.description.name == "prep"
-                && let Some(images) = scene_images(plan, &states[index], node, store, &mut datasets)
+            if is_prep(node)
+                && let Some(images) = scene_images(plan, &states[index], node, store, datasets)
             {
-                scenes.insert(index, images);
+                estimator.scenes.insert(index, images);
             }
         }
         let host = host_name();
         // Without readable records, the models' estimates are not corrected.
-        let mut records = store.records().unwrap_or_default();
-        records.retain(|record| record.host == host && record.model.is_some());
-        let threads = stage::processors().count as u64;
-        Self { plan, scenes, records, threads }
+        estimator.records = store.records().unwrap_or_default();
+        estimator.records.retain(|record| record.host == host && record.model.is_some());
+        estimator
     }
 
-    fn estimate(&self, node: &Node, state: &State) -> Option<Estimate> {
+    /// Estimates all nodes that aren't cached.
+    pub(crate) fn estimates(&self, states: &[State]) -> Estimates {
+        let missing = states.iter().enumerate().filter(|(_, state)| !is_cached(state));
+        let estimate = |(index, state): (usize, &State)| {
+            let key_parts = match state {
+                State::WillRun { key_parts } => Some(key_parts),
+                _ => None,
+            };
+            Some((index, self.estimate(index, key_parts)?))
+        };
+        let nodes: BTreeMap<usize, Estimate> = missing.clone().filter_map(estimate).collect();
+        let unknown = missing.count() - nodes.len();
+        let scenes = self.scenes.values().map(SceneImages::summary).collect();
+        Estimates { nodes, unknown, scenes }
+    }
+
+    /// Reads the scene that a node has made, if that is a node of `prep`. Before, its background
+    /// was a guess.
+    pub(crate) fn read_scene(&mut self, index: usize, artifact: &Path) {
+        if is_prep(&self.plan.nodes[index])
+            && let Some(images) = SceneImages::of_artifact(artifact)
+        {
+            self.scenes.insert(index, images);
+        }
+    }
+
+    /// Estimates a node. `key_parts` are missing until its inputs are known.
+    pub(crate) fn estimate(
+        &self,
+        index: usize,
+        key_parts: Option<&Map<String, Value>>,
+    ) -> Option<Estimate> {
+        let node = &self.plan.nodes[index];
         let program = &node.program.description.name;
         let work = self.work(node)?;
         let model = model_cost(program, &node.parameters, &work)?;
         let earlier =
-            self.nearest(node, state, model).and_then(|record| corrections(record, model));
+            self.nearest(node, key_parts, model).and_then(|record| corrections(record, model));
         let (time, memory) = earlier.unwrap_or_else(|| (slowness(), 1.0));
         let min_memory = min_memory(program, &node.parameters, &work)?;
         Some(Estimate {
@@ -129,12 +149,14 @@ impl<'a> Estimator<'a> {
 
     /// Returns the record of the nearest earlier run of a stage's program that has about the same
     /// size.
-    fn nearest(&self, node: &Node, state: &State, model: ModelCost) -> Option<&Record> {
+    fn nearest(
+        &self,
+        node: &Node,
+        key_parts: Option<&Map<String, Value>>,
+        model: ModelCost,
+    ) -> Option<&Record> {
         let program = node.program.description.name.as_str();
-        let known_parts = match state {
-            State::WillRun { key_parts } => key_parts.clone(),
-            _ => partial_key_parts(node),
-        };
+        let known_parts = key_parts.cloned().unwrap_or_else(|| partial_key_parts(node));
         let similar = self.records.iter().filter(|record| is_similar(record, program, model));
         nearest_record(&known_parts, similar)
     }
@@ -166,12 +188,16 @@ impl<'a> Estimator<'a> {
         let lr_images = training.and_then(|training| self.images(training)).map(|(_, lr)| lr);
         let lr_width = lr_images.unwrap_or_default().largest_size.0;
         let references = has_input("references").then(|| scene.images("references")).flatten();
+        let max_references = node.parameters["max_references"].as_u64().unwrap_or(u64::MAX);
+        let references = references.map(|images| images.limited(max_references));
+        let refiner = parent(node, "refiner").map(|(index, _)| &self.plan.nodes[index]);
         Some(Work {
             kind: scene.kind,
             pixels_across: scene.widths_across * lr_width as f64,
             has_box_kernel: scene.has_box_kernel,
             images,
             references: references.unwrap_or_default(),
+            refiner: refiner.map(|refiner| refiner.parameters.clone()),
             preparation_bytes: scene.preparation_bytes,
             field: training.map(|training| training.parameters.clone()),
             is_fine_tuning: has_input("init"),
@@ -262,24 +288,28 @@ fn parent<'n>(node: &'n Node, input: &str) -> Option<(usize, Option<&'n str>)> {
     }
 }
 
-/// Returns the images that a node of `prep` has made or will make. `datasets` has the data sets
-/// that were read already.
-fn scene_images<'p>(
-    plan: &'p Plan,
+fn is_cached(state: &State) -> bool {
+    matches!(state, State::Cached(_))
+}
+
+fn is_prep(node: &Node) -> bool {
+    node.program.description.name == "prep"
+}
+
+/// Returns the images that a node of `prep` has made or will make.
+fn scene_images(
+    plan: &Plan,
     state: &State,
-    prep: &'p Node,
+    prep: &Node,
     store: &Store,
-    datasets: &mut BTreeMap<&'p Path, Option<PlannedDataset>>,
+    datasets: &mut Datasets,
 ) -> Option<SceneImages> {
     if let State::Cached(record) = state {
         return SceneImages::of_artifact(&store.object(&record.output));
     }
     let dataset = prep.inputs.iter().find(|input| input.name == "dataset")?;
     match &dataset.from {
-        Origin::Folder(folder) => {
-            let set = datasets.entry(folder).or_insert_with(|| PlannedDataset::read(folder));
-            SceneImages::of_dataset(set.as_ref()?, &prep.parameters)
-        }
+        Origin::Folder(folder) => SceneImages::of_dataset(datasets.get(folder)?, &prep.parameters),
         Origin::Node { index, .. } => {
             let demo = &plan.nodes[*index];
             SceneImages::of_demo(&demo.parameters, &prep.parameters)

@@ -1,7 +1,8 @@
 //! Images of a scene, from an artifact of `prep` or from the data set that `prep` will read.
 
 use std::cell::OnceCell;
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use artifact::format_count;
 use dataset::{Border, Dataset, Frame, Split};
@@ -52,9 +53,24 @@ struct PlannedScene {
     is_benchmark: bool,
 }
 
+/// Data sets by folder, each read once.
+#[derive(Default)]
+pub(crate) struct Datasets(BTreeMap<PathBuf, Option<PlannedDataset>>);
+
+impl Datasets {
+    /// Returns a folder's data set; `None` if `prep` will refuse it.
+    pub(super) fn get(&mut self, folder: &Path) -> Option<&PlannedDataset> {
+        let read = || PlannedDataset::read(folder);
+        self.0.entry(folder.to_path_buf()).or_insert_with(read).as_ref()
+    }
+}
+
 /// Data set that `prep` will read.
-pub(crate) struct PlannedDataset {
+pub(super) struct PlannedDataset {
     dataset: Dataset,
+    /// Memory of reading each photograph, in bytes.
+    reading_bytes: Vec<u64>,
+    faces_one_direction: bool,
     /// Result of [`Self::is_opaque`], once computed.
     is_opaque: OnceCell<bool>,
 }
@@ -64,9 +80,16 @@ pub(crate) struct PlannedDataset {
 const MAX_SAMPLES: usize = 3;
 
 impl PlannedDataset {
-    /// Reads a data set; `None` if `prep` will refuse it.
-    pub(crate) fn read(folder: &Path) -> Option<Self> {
-        Some(Self { dataset: Dataset::read(folder).ok()?, is_opaque: OnceCell::new() })
+    fn read(folder: &Path) -> Option<Self> {
+        let dataset = Dataset::read(folder).ok()?;
+        // A file that can't be read is reported by `prep`.
+        let reading_bytes = |frame: &Frame| frame.reading_bytes().unwrap_or(0);
+        Some(Self {
+            reading_bytes: dataset.frames.iter().map(reading_bytes).collect(),
+            faces_one_direction: faces_one_direction(&dataset),
+            is_opaque: OnceCell::new(),
+            dataset,
+        })
     }
 
     /// Predicts from the borders of a few photographs whether `prep` will take the scene as opaque.
@@ -74,13 +97,19 @@ impl PlannedDataset {
         let frames = &self.dataset.frames;
         *self.is_opaque.get_or_init(|| {
             let count = frames.len().min(MAX_SAMPLES);
+            let mut common = None;
             for sample in 0..count {
                 let frame = &frames[sample * frames.len() / count];
                 // A photograph that can't be read is reported by `prep`.
                 let border = frame.photograph().map(|image| Border::of_frame(frame, &image));
                 match border {
                     Ok(Border::Alpha) => return false,
-                    Ok(border) if border.background().is_some() => {}
+                    Ok(border) if border.background().is_some() => {
+                        let background = border.background();
+                        if *common.get_or_insert(background) != background {
+                            return true;
+                        }
+                    }
                     _ => return true,
                 }
             }
@@ -114,12 +143,12 @@ impl SceneImages {
     }
 
     /// Predicts the images that `prep` makes of a data set.
-    pub(crate) fn of_dataset(set: &PlannedDataset, parameters: &Value) -> Option<Self> {
+    pub(super) fn of_dataset(set: &PlannedDataset, parameters: &Value) -> Option<Self> {
         let is_opaque = match parameters["background"].as_str() {
             Some(background) => background == "opaque",
             None => set.is_opaque(),
         };
-        let set = &set.dataset;
+        let PlannedDataset { dataset: set, reading_bytes, faces_one_direction, .. } = set;
         let all = set.frames.len();
         let split = match (parameters["split"].as_str(), &set.split) {
             // Approximate: `prep` removes the references from these test views.
@@ -128,16 +157,14 @@ impl SceneImages {
             (_, Some(split)) => split.clone(),
         };
         let space = parameters["space"].as_str();
-        let is_ndc = space.map_or_else(|| faces_one_direction(set), |space| space == "ndc");
+        let is_ndc = space.map_or(*faces_one_direction, |space| space == "ndc");
         let planned = PlannedScene {
             kind: kind_of(is_opaque, is_ndc),
             sizes: set.frames.iter().map(|frame| size_of(frame.intrinsics())).collect(),
             split,
             is_benchmark: set.format.is_benchmark(),
         };
-        // A file that can't be read is reported by `prep`.
-        let reading = |index: usize| set.frames[index].reading_bytes().unwrap_or(0);
-        Some(Self::from_plan(&planned, parameters, reading))
+        Some(Self::from_plan(&planned, parameters, |index| reading_bytes[index]))
     }
 
     /// Predicts the images that `prep` makes of the demo scene.
@@ -147,8 +174,13 @@ impl SceneImages {
         let size = (width, (width / number("aspect")?).round());
         let train = train as usize;
         let all = train + test as usize;
+        let has_backdrop = demo["backdrop"].as_bool()?;
+        let background = parameters["background"].as_str();
+        let space = parameters["space"].as_str();
+        let is_opaque = background.map_or(has_backdrop, |background| background == "opaque");
+        let is_ndc = space.map_or(demo["layout"] == "forward", |space| space == "ndc");
         let planned = PlannedScene {
-            kind: kind_of(demo["backdrop"].as_bool()?, false),
+            kind: kind_of(is_opaque, is_ndc),
             sizes: vec![size; all],
             split: Split { train: (0..train).collect(), test: (train..all).collect() },
             is_benchmark: true,
@@ -345,6 +377,15 @@ mod tests {
         let demo = json!({"size": 200, "aspect": 1.0, "train": 80, "test": 10, "backdrop": true});
         let scene = SceneImages::of_demo(&demo, &json!({"scale": 2, "hr_references": 1})).unwrap();
         assert_eq!(scene.kind, SceneKind::Unbounded);
+        let mut forward = demo.clone();
+        forward["layout"] = json!("forward");
+        for (parameters, kind) in [
+            (json!({}), SceneKind::Frustum),
+            (json!({"space": "contraction"}), SceneKind::Unbounded),
+            (json!({"background": "white"}), SceneKind::Object),
+        ] {
+            assert_eq!(SceneImages::of_demo(&forward, &parameters).unwrap().kind, kind);
+        }
         let (lr, hr) = (80 * 10_000, 10 * 40_000);
         let expected = [(80, lr), (80, lr / 4), (80, 4 * lr), (10, hr), (10, hr), (1, 40_000)];
         assert_eq!(sizes(&scene), expected);

@@ -23,6 +23,11 @@ impl Images {
         self.largest_size.0 * self.largest_size.1
     }
 
+    /// Returns the first images; `pixels` stays.
+    pub(crate) fn limited(self, max_count: u64) -> Self {
+        Self { count: self.count.min(max_count), ..self }
+    }
+
     /// Returns the same number of images, scaled to the width of the parameter `size` if that is
     /// set.
     pub(crate) fn with_size(self, parameters: &Value) -> Self {
@@ -45,8 +50,10 @@ pub(crate) struct Work {
     pub(crate) has_box_kernel: bool,
     /// Images that the stage reads or renders.
     pub(crate) images: Images,
-    /// HR references of a training.
+    /// HR references that the stage may use.
     pub(crate) references: Images,
+    /// Parameters of the training of the refiner that the stage applies.
+    pub(crate) refiner: Option<Value>,
     /// Peak memory of preparing a view.
     pub(crate) preparation_bytes: u64,
     /// Parameters of the training of the field that is rendered.

@@ -1,6 +1,5 @@
 //! The local executor: runs nodes whose parents are done, several at once, and then the sinks.
 
-use std::borrow::Cow;
 use std::cell::OnceCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::ExitCode;
@@ -15,7 +14,7 @@ use store::Record;
 
 use super::budget::{Admission, Budget, Demand};
 use super::node::{Lookup, NodeJob, PendingAction, input_folder};
-use crate::estimates::{Estimates, check_memory, run_text, total_comparison_text};
+use crate::estimates::{Datasets, Estimator, check_memory, run_text, total_comparison_text};
 use crate::run_messages::{command_text, end_message, failure_message};
 use crate::run_record::RunProgress;
 use crate::session::{Run, command_line};
@@ -40,11 +39,13 @@ impl Local {
     pub(crate) fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
         let plan = run.plan;
         let free = available_memory()?.unwrap_or(u64::MAX).min(self.budget.memory);
-        check_memory(plan, run.estimates, free)?;
-        if let Some(text) = run_text(plan, run.estimates, self.budget.cores) {
+        let estimator = Estimator::new(plan, run.states, run.store, &mut Datasets::default());
+        let estimates = estimator.estimates(run.states);
+        check_memory(plan, &estimates, free)?;
+        if let Some(text) = run_text(plan, &estimates, self.budget.cores) {
             report_text(&format!("nerf-sr: {text}"));
         }
-        let NodesOutcome { progress, skipped } = run_nodes(run, self);
+        let NodesOutcome { progress, skipped } = run_nodes(run, self, estimator);
         if run.stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
         }
@@ -71,7 +72,7 @@ impl Local {
         let ran = progress.ran.iter().flatten();
         let end = end_message(ran.clone().count(), plan.nodes.len(), sinks.has_written);
         let ran = ran.filter_map(|&index| Some((index, progress.records[index].as_ref()?)));
-        let comparison = total_comparison_text(run.estimates, ran);
+        let comparison = total_comparison_text(&estimates, ran);
         print_line!("{end}{}", comparison.map_or_else(String::new, |text| format!("; {text}")));
         Ok(ExitCode::SUCCESS)
     }
@@ -127,7 +128,7 @@ struct NodesOutcome {
     skipped: usize,
 }
 
-fn run_nodes(run: &Run<'_>, options: &Local) -> NodesOutcome {
+fn run_nodes<'a>(run: &'a Run<'a>, options: &'a Local, estimator: Estimator<'a>) -> NodesOutcome {
     let display = Display::default();
     let count = run.plan.nodes.len();
     let mut schedule = Schedule {
@@ -138,7 +139,7 @@ fn run_nodes(run: &Run<'_>, options: &Local) -> NodesOutcome {
         ready: BTreeMap::new(),
         running: BTreeMap::new(),
         records: OnceCell::new(),
-        estimates: Cow::Borrowed(run.estimates),
+        estimator,
         progress: RunProgress {
             records: vec![None; count],
             ran: Some(BTreeSet::new()),
@@ -179,8 +180,7 @@ struct Schedule<'a> {
     running: BTreeMap<usize, Demand>,
     /// All records of the store, read when the first node isn't cached.
     records: OnceCell<Vec<Record>>,
-    /// Expected costs of the nodes, as far as known.
-    estimates: Cow<'a, Estimates>,
+    estimator: Estimator<'a>,
     progress: RunProgress,
 }
 
@@ -211,8 +211,7 @@ impl<'a> Schedule<'a> {
             .collect();
         let threads = self.options.budget.cores;
         let (run, display) = (self.run, self.display);
-        let estimate = self.estimates.nodes.get(&index).copied();
-        NodeJob { run, node, parents, threads, display, estimate, watch: None }
+        NodeJob { run, node, parents, threads, display, estimate: None, watch: None }
     }
 
     /// Finds the stages that render and score a node's checkpoints, if `--watch` is given.
@@ -268,7 +267,8 @@ impl<'a> Schedule<'a> {
             match self.options.budget.admission(&self.running, node.demand) {
                 Admission::Start if !self.is_stopping() => {
                     self.running.insert(index, node.demand);
-                    let job = NodeJob { watch: self.watch(index), ..self.job(index) };
+                    let estimate = self.estimator.estimate(index, Some(&node.action.key_parts));
+                    let job = NodeJob { estimate, watch: self.watch(index), ..self.job(index) };
                     admitted.push((index, job, node.action));
                     continue;
                 }
@@ -292,25 +292,13 @@ impl<'a> Schedule<'a> {
         self.running.remove(&index);
         match result {
             Ok((record, ran)) => {
+                self.estimator.read_scene(index, &self.run.store.object(&record.output));
                 self.progress.records[index] = Some(record);
                 if ran {
                     self.progress.ran.get_or_insert_default().insert(index);
-                    if self.run.plan.nodes[index].program.description.name == "prep" {
-                        self.estimate_again();
-                    }
                 }
             }
             Err(error) => self.fail(index, &error),
-        }
-    }
-
-    /// Estimates the remaining nodes again, from the scene that `prep` has made: before, its
-    /// background was a guess.
-    fn estimate_again(&mut self) {
-        let Run { plan, store, .. } = self.run;
-        // Without the nodes' states, the earlier estimates stay.
-        if let Ok(states) = plan.states(store, None) {
-            self.estimates = Cow::Owned(Estimates::new(plan, &states, store));
         }
     }
 

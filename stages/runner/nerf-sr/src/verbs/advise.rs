@@ -4,7 +4,7 @@ use artifact::{format_count, format_duration, format_size, print_line};
 use planning::{Plan, Quality, Request};
 use slurm::Memory;
 
-use crate::estimates::Estimate;
+use crate::estimates::{Datasets, Estimate};
 use crate::run_messages::command_text;
 use crate::session::Session;
 
@@ -88,9 +88,10 @@ pub(crate) fn advise(
     arguments: &[String],
 ) -> anyhow::Result<()> {
     let processors = stage::processors().count;
+    let mut datasets = Datasets::default();
     let mut all = Vec::new();
     for quality in Quality::ALL {
-        all.push(costs(session, request, quality)?);
+        all.push(costs(session, request, quality, &mut datasets)?);
     }
     print_table(&all, processors);
     let chosen = choose(&all, limits, processors);
@@ -153,11 +154,16 @@ fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> &QualityCo
 
 /// Returns the costs of the stages that would run with a quality. For the first quality, also
 /// prints the scenes.
-fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Result<QualityCosts> {
+fn costs(
+    session: &Session,
+    request: &Request,
+    quality: Quality,
+    datasets: &mut Datasets,
+) -> anyhow::Result<QualityCosts> {
     let mut request = request.clone();
     request.parameters.push(format!("quality={}", quality.name()));
     let planned = session.plan_with_states(&request)?;
-    let estimates = planned.estimates();
+    let estimates = planned.estimates(datasets);
     if quality == Quality::ALL[0] {
         for scene in &estimates.scenes {
             print_line!("{scene}");
@@ -170,7 +176,7 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
     });
     let mut excludes_refining = false;
     if parts[REFINING] == Cost::default()
-        && let Some(refining) = refining_cost(session, &request, &planned.plan)
+        && let Some(refining) = refining_cost(session, &request, &planned.plan, datasets)
     {
         parts[REFINING] = refining;
         excludes_refining = true;
@@ -188,14 +194,19 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
 
 /// Returns the additional cost of refining the views of a plan; `None` if the request names
 /// targets, or if the target that refines can't be planned, as in a pipeline without it.
-fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Cost> {
+fn refining_cost(
+    session: &Session,
+    request: &Request,
+    plan: &Plan,
+    datasets: &mut Datasets,
+) -> Option<Cost> {
     if !request.targets.is_empty() {
         return None;
     }
     let targets = vec![REFINING_TARGET.to_owned()];
     let request = Request { targets, ..request.clone() };
     let refined = session.plan_with_states(&request).ok()?;
-    let estimates = refined.estimates();
+    let estimates = refined.estimates(datasets);
     let is_new = |index: &usize| {
         let new = &refined.plan.nodes[*index];
         !plan.nodes.iter().any(|node| (&node.stage, &node.point) == (&new.stage, &new.point))

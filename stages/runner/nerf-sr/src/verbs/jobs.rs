@@ -14,7 +14,6 @@ use slurm::{Queue, Slurm, Submission};
 use store::{Record, Store};
 
 use super::run::begin_run;
-use crate::estimates::Estimates;
 use crate::execute::{Lookup, NodeJob};
 use crate::run_record::RunProgress;
 use crate::session::Run;
@@ -50,15 +49,13 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let store = Store::open(root)?;
     let frozen = FrozenPlan::read(&Submission::plan_path(folder))?;
     let plan = frozen.task_plan(number)?;
-    let result = begin_run(&store, &plan, &stop).and_then(|(file, _)| {
+    let result = begin_run(&store, &plan, &stop).and_then(|(file, states)| {
         // The command line of the run that wrote the submission, unless its file was deleted.
         let id = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
         let submitting = store.run_or_pin(id).ok().flatten();
         let command = submitting.map(|run| run.command).unwrap_or_default();
         let (plan, store, out) = (&plan, &store, frozen.out.as_path());
-        // No estimates: those of the submitting machine may not be valid on this one.
-        let estimates = &Estimates::default();
-        let run = Run { plan, store, file: &file, out, estimates, stop: &stop };
+        let run = Run { plan, states: &states, store, file: &file, out, stop: &stop };
         let result = run_task(&run, command);
         file.end().ok();
         result

@@ -7,7 +7,6 @@ use planning::stage_call::stop_on_signals;
 use planning::{Describing, Plan, Request, State, stored_inputs};
 use store::{RunFile, Store};
 
-use crate::planned::Planned;
 use crate::session::{Run, Session, check_not_in_input, command_line};
 use crate::waiting::enter_store;
 
@@ -24,9 +23,7 @@ pub(crate) fn run(
     plan.check_folders()?;
     let (file, states) = begin_run(&session.store, &plan, &stop)?;
     let store = &session.store;
-    let planned = Planned { store, plan, states };
-    let estimates = &planned.estimates();
-    let run = Run { plan: &planned.plan, store, file: &file, out, estimates, stop: &stop };
+    let run = Run { plan: &plan, states: &states, store, file: &file, out, stop: &stop };
     let result = carry_out(&run);
     // If the end can't be recorded, as on a full disk, the run's age is counted from its start.
     file.end().ok();

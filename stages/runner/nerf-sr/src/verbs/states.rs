@@ -5,6 +5,7 @@ use planning::{Request, short_hash};
 use store::Record;
 
 use super::print_json;
+use crate::estimates::Datasets;
 use crate::planned::{ArtifactReport, PlanReport, Planned, age_text};
 use crate::session::{Session, nodes_of_stage};
 
@@ -14,7 +15,7 @@ pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::
     if json {
         return print_json(&PlanReport::new(&planned, &[])?);
     }
-    let estimates = planned.estimates();
+    let estimates = planned.estimates(&mut Datasets::default());
     for (index, node) in planned.plan.nodes.iter().enumerate() {
         let mut text = planned.state_text(index, None);
         if let Some(estimate) = estimates.nodes.get(&index) {
