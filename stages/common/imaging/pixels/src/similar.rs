@@ -1,4 +1,4 @@
-//! Comparisons of 8-bit colours.
+//! Comparisons of 8-bit colours, and medians by component.
 
 /// Returns the median of each component; zeros for an empty list.
 pub fn medians<T: Copy + Default + Ord, const N: usize>(items: &[[T; N]]) -> [T; N] {

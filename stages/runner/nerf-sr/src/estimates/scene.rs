@@ -101,16 +101,14 @@ impl PlannedDataset {
             for sample in 0..count {
                 let frame = &frames[sample * frames.len() / count];
                 // A photograph that can't be read is reported by `prep`.
-                let border = frame.photograph().map(|image| Border::of_frame(frame, &image));
-                match border {
-                    Ok(Border::Alpha) => return false,
-                    Ok(border) if border.background().is_some() => {
-                        let background = border.background();
-                        if *common.get_or_insert(background) != background {
-                            return true;
-                        }
-                    }
-                    _ => return true,
+                let Ok(image) = frame.photograph() else { return true };
+                let border = Border::of_frame(frame, &image);
+                if border == Border::Alpha {
+                    return false;
+                }
+                let Some(background) = border.background() else { return true };
+                if *common.get_or_insert(background) != background {
+                    return true;
                 }
             }
             false
