@@ -1,5 +1,7 @@
 //! Fixed work like that of a field: dense layers and reads of hashed entries.
 
+use std::sync::Arc;
+
 use crate::kernel;
 use crate::simd::{LANES, Quad};
 
@@ -18,12 +20,13 @@ const READS: u32 = 32_768;
 /// Multiplier of the hash (Knuth).
 const HASH: u32 = 2_654_435_761;
 
-/// Fixed work, with its data, whose running time measures a machine's speed.
+/// Fixed work, with its data, whose running time measures a machine's speed. Clones share the table,
+/// as the threads of a training do.
 #[derive(Clone, Debug)]
 pub struct SpeedTest {
     weights: Vec<f32>,
     samples: Vec<f32>,
-    table: Vec<[f32; 4]>,
+    table: Arc<[[f32; 4]]>,
     outputs: Vec<f32>,
     sum: [f32; 4],
 }
@@ -33,7 +36,7 @@ impl Default for SpeedTest {
         Self {
             weights: vec![0.01; WIDTH * WIDTH],
             samples: vec![0.5; WIDTH * SAMPLES],
-            table: vec![[0.25; 4]; 1 << LOG2_ENTRIES],
+            table: vec![[0.25; 4]; 1 << LOG2_ENTRIES].into(),
             outputs: vec![0.0; WIDTH * SAMPLES],
             sum: [0.0; 4],
         }

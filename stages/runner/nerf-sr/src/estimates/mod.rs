@@ -1,7 +1,7 @@
 //! Estimates of the processor time and peak memory of stages (docs/design/048).
 //!
 //! * `costs`: models of the stages, from numbers of rays and pixels, and the speed of this machine,
-//!   by a measurement of a few milliseconds.
+//!   by a short measurement on all cores.
 //! * `work`, `scene`: number and size of the images, from an artifact of `prep`, from the data set,
 //!   or of the frames along a `camera-path`.
 //! * `text`: estimates as text, before and after a run.
