@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use artifact::format_count;
 use dataset::{Border, Dataset, Frame, Split};
-use pixels::{DEGRADATION_FILE, Filter, Kernel};
-use scene::{Background, Camera, Intrinsics, Space, VIEWS_FILE, Views, common_direction};
+use pixels::{DEGRADATION_FILE, Degradation, Filter, Kernel};
+use scene::{Background, Camera, Intrinsics, Space, VIEWS_FILE, View, Views, common_direction};
 use serde::Deserialize;
 use serde_json::Value;
 use store::SceneKind;
@@ -120,6 +120,12 @@ impl SceneImages {
     /// Reads the images of an existing artifact.
     pub(crate) fn of_artifact(artifact: &Path) -> Option<Self> {
         let mut scene = Self { widths_across: 1.0, ..Self::default() };
+        let mut hr_width = None;
+        if let Ok(bytes) = std::fs::read(artifact.join("train").join(DEGRADATION_FILE)) {
+            let degradation: Degradation = serde_json::from_slice(&bytes).ok()?;
+            scene.has_box_kernel = degradation.kernel.filter() == Filter::Box;
+            hr_width = Some(f64::from(degradation.hr[0]));
+        }
         for folder in FOLDERS {
             let Ok(bytes) = std::fs::read(artifact.join(folder).join(VIEWS_FILE)) else {
                 continue;
@@ -127,15 +133,14 @@ impl SceneImages {
             let Views { background, bounds, views, .. } = serde_json::from_slice(&bytes).ok()?;
             let is_ndc = matches!(bounds.space, Space::Ndc(_));
             scene.kind = kind_of(background == Background::Opaque, is_ndc);
-            let sizes: Vec<Intrinsics> = views.iter().map(|view| view.camera.intrinsics).collect();
-            scene.widths_across =
-                sizes.first().map_or(1.0, |size| widths_across(&bounds.space, size));
-            let sizes: Vec<(f64, f64)> = sizes.into_iter().map(size_of).collect();
+            if let Some(view) = views.first() {
+                scene.widths_across = widths_across(&bounds.space, &view.camera.intrinsics);
+            }
+            let lr_width = scene.images("train").map(|images| images.largest_size.0 as f64);
+            let lr_factor = lr_width.zip(hr_width).map_or(1.0, |(lr, hr)| lr / hr);
+            let sizes: Vec<(f64, f64)> =
+                views.iter().map(|view| image_size(view, lr_factor)).collect();
             scene.folders.push((folder, images_of(&sizes)));
-        }
-        if let Ok(bytes) = std::fs::read(artifact.join("train").join(DEGRADATION_FILE)) {
-            let degradation: Value = serde_json::from_slice(&bytes).ok()?;
-            scene.has_box_kernel = is_mean_kernel(&degradation["kernel"], false);
         }
         Some(scene)
     }
@@ -313,6 +318,16 @@ fn is_mean_kernel(kernel: &Value, by_default: bool) -> bool {
     kernel.map_or(by_default, |kernel| kernel.filter() == Filter::Box)
 }
 
+/// Returns the size of a view's image, or of its camera if the view has no image. Of a test view
+/// without HR truth, this is the LR photograph, on which the view is scored.
+fn image_size(view: &View, lr_factor: f64) -> (f64, f64) {
+    let (width, height) = size_of(view.camera.intrinsics);
+    match &view.low_resolution {
+        Some(_) if view.image.is_none() => (width * lr_factor, height * lr_factor),
+        _ => (width, height),
+    }
+}
+
 fn size_of(image: Intrinsics) -> (f64, f64) {
     (f64::from(image.width), f64::from(image.height))
 }
@@ -360,7 +375,7 @@ fn frames(count: u64, largest_size: (u64, u64), parameters: &Value) -> Images {
 
 #[cfg(test)]
 mod tests {
-    use scene::{Bounds, Camera, Frustum, View};
+    use scene::{Bounds, Frustum};
     use serde_json::json;
 
     use super::*;
@@ -455,6 +470,23 @@ mod tests {
             Frustum { camera_to_world, min: [-0.5, -0.25], max: [0.5, 0.25], near: 1.0, far: 2.0 };
         let scene = scene_in(Space::Ndc(frustum));
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Frustum, 1.5));
+
+        // A test view without HR truth has the size of its photograph.
+        let truth = folder.path().join("truth");
+        std::fs::create_dir(&truth).unwrap();
+        let degradation = Degradation { kernel: Kernel::Box, hr: [60, 40] };
+        artifact::write_json(&train.join(DEGRADATION_FILE), &degradation).unwrap();
+        for (image, size) in [(None, (30, 20)), (Some("images/c.png".to_owned()), (60, 40))] {
+            let camera = view("c").camera.resized(60, 40);
+            let low_resolution = Some("low/c.png".to_owned());
+            let test_view = View { image, low_resolution, ..View::camera_only(camera) };
+            let bounds = Bounds::cube(1.0, 2.0, 6.0);
+            let views = Views::new(Background::Opaque, bounds, vec![test_view]);
+            artifact::write_json(&truth.join(VIEWS_FILE), &views).unwrap();
+            let scene = SceneImages::of_artifact(folder.path()).unwrap();
+            assert!(scene.has_box_kernel);
+            assert_eq!(scene.images("truth").unwrap().largest_size, size);
+        }
         std::fs::write(train.join(VIEWS_FILE), "{").unwrap();
         assert!(SceneImages::of_artifact(folder.path()).is_none());
     }
