@@ -151,6 +151,15 @@ impl Resolved {
         }
     }
 
+    /// Returns the fraction of the rays, at first, during which each LR pixel has one ray and later
+    /// has several.
+    pub fn single_ray_share(&self) -> f64 {
+        match warmup_doublings(whole_supersample(self.supersample)) {
+            0 => 0.0,
+            doublings => self.supersample_warmup / f64::from(doublings),
+        }
+    }
+
     /// Returns the number of bundles (the rays of one LR pixel) in the first `precrop_steps` steps,
     /// which are drawn from the middle of the images.
     pub fn precrop_bundles(&self) -> u64 {

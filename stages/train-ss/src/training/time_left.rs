@@ -19,6 +19,9 @@ const COURSE: [(f64, f64); 9] = [
     (2000.0, 1.1),
     (4000.0, 1.0),
 ];
+/// Cost of a ray while each LR pixel has one ray, relative to the cost of a late ray of several:
+/// neighbouring rays read the same cells. Lego 100×2 and fern 252×2.
+const SINGLE_RAY_COST: f64 = 1.25;
 /// Minimum number of steps over which the current pace is averaged; chosen by hand.
 const MIN_WINDOW_STEPS: f64 = 32.0;
 /// Number of steps taken, divided by the number of steps in the averaging window; chosen by hand.
@@ -43,6 +46,8 @@ pub(crate) struct TrainingRays {
 pub(crate) struct TimeLeft {
     /// True if a ray's cost follows [`COURSE`].
     has_course: bool,
+    /// Fraction of the rays, at first, during which each LR pixel has one ray and later has several.
+    single_ray_share: f64,
     /// End of the last step.
     last: Instant,
     /// Number of steps that this process has taken.
@@ -58,6 +63,7 @@ impl TimeLeft {
         let is_grid = matches!(params.field, ResolvedField::Grid { .. });
         Self {
             has_course: is_grid && !is_initialised,
+            single_ray_share: params.single_ray_share(),
             last: Instant::now(),
             steps: 0.0,
             seconds: 0.0,
@@ -87,22 +93,26 @@ impl TimeLeft {
         }
         // The recent steps' average is the pace of half a window ago, which matters at first.
         let before = (step as f64 - MIN_WINDOW_STEPS / 2.0).max(0.0);
-        let cost = self.cost(before);
+        let (total, remaining) = (rays.total.max(1) as f64, rays.remaining as f64);
+        let left_before = (remaining + self.rays / 2.0).min(total);
+        let cost = self.cost(before, 1.0 - left_before / total);
         let late_rays_per_step = (cost * self.rays / self.window().min(self.steps)).max(1.0);
-        let own = self.late_rays(step as f64, rays.remaining as f64, late_rays_per_step);
-        let each = self.late_rays(0.0, rays.total as f64, late_rays_per_step);
-        let others = rays.further as f64 / rays.total.max(1) as f64 * each;
+        let own = self.late_rays(step as f64, remaining, total, late_rays_per_step);
+        let each = self.late_rays(0.0, total, total, late_rays_per_step);
+        let others = rays.further as f64 / total * each;
         self.seconds / self.rays / cost * (own + others)
     }
 
-    /// Returns the number of late rays that cost as much as `rays` from a step on.
-    fn late_rays(&self, mut step: f64, rays: f64, late_rays_per_step: f64) -> f64 {
-        let mut sum = 0.0;
+    /// Returns the number of late rays that cost as much as the last `remaining` of `total` rays,
+    /// from a step on.
+    fn late_rays(&self, mut step: f64, remaining: f64, total: f64, late_rays_per_step: f64) -> f64 {
+        let (mut sum, mut left) = (0.0, remaining);
         for part in 1..=PARTS {
             // Later parts are larger, since costs change early.
-            let part = rays * f64::from(part) / f64::from(PARTS * (PARTS + 1) / 2);
-            let late_rays = part * self.cost(step);
+            let part = remaining * f64::from(part) / f64::from(PARTS * (PARTS + 1) / 2);
+            let late_rays = part * self.cost(step, 1.0 - left / total);
             sum += late_rays;
+            left -= part;
             // Steps have about equal costs.
             step += late_rays / late_rays_per_step;
         }
@@ -114,11 +124,16 @@ impl TimeLeft {
         (self.steps / STEPS_PER_WINDOW_STEP).max(MIN_WINDOW_STEPS)
     }
 
-    /// Returns the cost of a ray at a step, relative to a late ray.
-    fn cost(&self, step: f64) -> f64 {
+    /// Returns the cost of a ray at a step and after a fraction of the rays, relative to a late ray.
+    fn cost(&self, step: f64, fraction: f64) -> f64 {
         if !self.has_course {
             return 1.0;
         }
+        let bundle = if fraction < self.single_ray_share { SINGLE_RAY_COST } else { 1.0 };
+        bundle * Self::course_cost(step)
+    }
+
+    fn course_cost(step: f64) -> f64 {
         let after = COURSE.iter().position(|(end, _)| *end > step).unwrap_or(COURSE.len());
         let Some(&(end, end_cost)) = COURSE.get(after) else { return 1.0 };
         let (start, start_cost) = COURSE[after - 1];
@@ -158,6 +173,7 @@ mod tests {
     fn unmeasured() -> TimeLeft {
         let zero = TimeLeft {
             has_course: true,
+            single_ray_share: 0.3,
             last: Instant::now(),
             steps: 0.0,
             seconds: 0.0,
@@ -224,8 +240,9 @@ mod tests {
     #[test]
     fn costs_fall_to_one() {
         let time_left = unmeasured();
-        let costs: Vec<f64> = (0..100).map(|i| time_left.cost(f64::from(i * 50))).collect();
+        let costs: Vec<f64> = (0..100).map(|i| time_left.cost(f64::from(i * 50), 0.5)).collect();
         assert!(costs.is_sorted_by(|a, b| a >= b));
         assert_eq!((costs[0], costs[99]), (COURSE[0].1, 1.0));
+        assert_eq!(time_left.cost(5000.0, 0.2), SINGLE_RAY_COST);
     }
 }
