@@ -143,10 +143,15 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Returns the index of the row with the best mean of the first figure, the first of equal
+    /// Returns the figure that tells the best row: the first one with values.
+    pub(crate) fn main_figure(&self) -> Option<&ScoreFormat> {
+        self.known_figures().first().copied()
+    }
+
+    /// Returns the index of the row with the best mean of the main figure, the first of equal
     /// ones. Without figures, returns that of the first row.
     pub(crate) fn best_row(&self) -> Option<usize> {
-        let figure = self.figures.first();
+        let figure = self.main_figure();
         let is_lower_better = figure.is_some_and(|f| f.higher_is_better == Some(false));
         let sign = if is_lower_better { -1.0 } else { 1.0 };
         let value = |&row: &usize| Some(sign * self.rows[row].mean(figure?)?);

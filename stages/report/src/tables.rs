@@ -24,9 +24,9 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
     let known = report.figures.iter().filter_map(|figure| Some((figure, best.mean(figure)?)));
     html! {
         section class="summary" aria-label="Summary" {
-            @if report.rows.len() > 1 {
-                p { "Best by " (without_arrow(&report.figures[0].label)) " of "
-                    (report.rows.len()) " results: " b { (best.label) } }
+            @if let Some(figure) = report.main_figure() && report.rows.len() > 1 {
+                p { "Best by " (without_arrow(&figure.label)) " of " (report.rows.len())
+                    " results: " b { (best.label) } }
             }
             dl {
                 @for (figure, mean) in known.take(SUMMARY_FIGURES) {
@@ -246,12 +246,11 @@ mod tests {
 
     use super::*;
 
-    fn run(folder: &Path, data_sets: [&str; 2]) -> RunRecord {
+    fn run(folder: &Path, data_sets: [&str; 2], metrics: [serde_json::Value; 2]) -> RunRecord {
         let mut nodes = Vec::new();
-        for (i, data_set) in data_sets.into_iter().enumerate() {
+        for (i, (data_set, metrics)) in data_sets.into_iter().zip(metrics).enumerate() {
             let output = folder.join(i.to_string());
             std::fs::create_dir_all(&output).unwrap();
-            let metrics = json!({"mean": {"psnr": 20 + i}, "views": [{"name": "a", "scores": {}}]});
             std::fs::write(output.join("metrics.json"), metrics.to_string()).unwrap();
             let node = |kind: &str, inputs: serde_json::Value| {
                 json!({"stage": kind, "point": format!("point={i}"), "kind": kind, "key": "",
@@ -264,13 +263,40 @@ mod tests {
         serde_json::from_value(json!({"nodes": nodes})).unwrap()
     }
 
+    /// Returns the metrics of one view.
+    fn metrics(mean: &serde_json::Value) -> serde_json::Value {
+        json!({"mean": mean, "views": [{"name": "a", "scores": {}}]})
+    }
+
     #[test]
     fn the_best_result_is_one_of_a_single_data_set() {
         let folder = tempfile::tempdir().unwrap();
         for (data_sets, has_best) in [(["lego", "lego"], true), (["lego", "chair"], false)] {
-            let run = run(folder.path(), data_sets);
+            let scores = [20, 21].map(|psnr| metrics(&json!({"psnr": psnr})));
+            let run = run(folder.path(), data_sets, scores);
             let text = summary(&Report::new(&run)).into_string();
             assert_eq!(text.contains("of 2 results: <b>point=1</b>"), has_best, "{text}");
         }
+    }
+
+    /// Photographs without HR truth have neither PSNR nor LPIPS.
+    #[test]
+    fn a_figure_without_values_decides_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let figures = json!([
+            {"path": "lpips", "label": "LPIPS ↓", "digits": 4, "higher_is_better": false,
+                "missing": "weights not given"},
+            {"path": "low", "label": "PSNR at LR ↑ dB", "digits": 2, "higher_is_better": true},
+        ]);
+        let scores = [27.3, 27.4].map(|psnr| {
+            let mut metrics = metrics(&json!({"low": psnr}));
+            metrics["figures"] = figures.clone();
+            metrics
+        });
+        let text = summary(&Report::new(&run(folder.path(), ["a"; 2], scores))).into_string();
+        assert!(text.contains("Best by PSNR at LR dB of 2 results: <b>point=1</b>"), "{text}");
+        let none = [(); 2].map(|()| metrics(&json!({})));
+        let text = summary(&Report::new(&run(folder.path(), ["a"; 2], none))).into_string();
+        assert!(!text.contains("Best by"), "{text}");
     }
 }
