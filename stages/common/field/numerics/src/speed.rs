@@ -20,8 +20,8 @@ const READS: u32 = 32_768;
 /// Multiplier of the hash (Knuth).
 const HASH: u32 = 2_654_435_761;
 
-/// Fixed work, with its data, whose running time measures a machine's speed. Clones share the table,
-/// as the threads of a training do.
+/// Fixed work, with its data, whose running time measures a machine's speed. Clones share the
+/// table, as the threads of a training do.
 #[derive(Clone, Debug)]
 pub struct SpeedTest {
     weights: Vec<f32>,

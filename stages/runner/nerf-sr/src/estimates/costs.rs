@@ -279,8 +279,9 @@ pub(crate) fn slowness() -> f64 {
 fn measure() -> f64 {
     let test = SpeedTest::default();
     let mut times = std::thread::scope(|scope| {
-        let start = |_| Builder::new().spawn_scoped(scope, || working_times(test.clone())).ok();
-        let threads: Vec<_> = (0..stage::processors().count).filter_map(start).collect();
+        let threads: Vec<_> = (0..stage::processors().count)
+            .filter_map(|_| Builder::new().spawn_scoped(scope, || working_times(test.clone())).ok())
+            .collect();
         let times = threads.into_iter().map(|thread| thread.join().unwrap_or_default());
         times.collect::<Vec<_>>().concat()
     });

@@ -83,9 +83,9 @@ impl PlannedDataset {
     fn read(folder: &Path) -> Option<Self> {
         let dataset = Dataset::read(folder).ok()?;
         // A file that can't be read is reported by `prep`.
-        let reading_bytes = |frame: &Frame| frame.reading_bytes().unwrap_or(0);
+        let reading_bytes = dataset.frames.iter().map(|frame| frame.reading_bytes().unwrap_or(0));
         Some(Self {
-            reading_bytes: dataset.frames.iter().map(reading_bytes).collect(),
+            reading_bytes: reading_bytes.collect(),
             faces_one_direction: faces_one_direction(&dataset),
             is_opaque: OnceCell::new(),
             dataset,
