@@ -136,6 +136,7 @@ impl SceneImages {
             if let Some(view) = views.first() {
                 scene.widths_across = widths_across(&bounds.space, &view.camera.intrinsics);
             }
+            // `train` is the first folder.
             let lr_width = scene.images("train").map(|images| images.largest_size.0 as f64);
             let lr_factor = lr_width.zip(hr_width).map_or(1.0, |(lr, hr)| lr / hr);
             let sizes: Vec<(f64, f64)> =
