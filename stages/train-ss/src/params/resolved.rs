@@ -151,12 +151,11 @@ impl Resolved {
         }
     }
 
-    /// Returns the fraction of the rays, at first, during which each LR pixel has one ray and later
-    /// has several.
-    pub fn single_ray_share(&self) -> f64 {
+    /// Returns the number of rays, at first, while each LR pixel has one ray and later has several.
+    pub fn single_rays(&self) -> f64 {
         match warmup_doublings(whole_supersample(self.supersample)) {
             0 => 0.0,
-            doublings => self.supersample_warmup / f64::from(doublings),
+            doublings => self.supersample_warmup * self.rays as f64 / f64::from(doublings),
         }
     }
 
@@ -166,9 +165,7 @@ impl Resolved {
         let batch = u64::from(self.max_rays_per_step);
         let supersample = whole_supersample(self.supersample);
         let doublings = warmup_doublings(supersample);
-        let stage_steps = (self.supersample_warmup * self.rays as f64 / f64::from(doublings.max(1)))
-            as u64
-            / batch;
+        let stage_steps = self.single_rays() as u64 / batch;
         let warmup = (0..doublings).map(|doubling| (stage_steps, 1 << doubling));
         let mut steps_left = u64::from(self.precrop_steps);
         let mut bundles = 0;

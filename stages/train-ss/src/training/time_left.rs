@@ -46,8 +46,8 @@ pub(crate) struct TrainingRays {
 pub(crate) struct TimeLeft {
     /// True if a ray's cost follows [`COURSE`].
     has_course: bool,
-    /// Fraction of the rays, at first, during which each LR pixel has one ray and later has several.
-    single_ray_share: f64,
+    /// Number of rays, at first, that cost [`SINGLE_RAY_COST`].
+    single_rays: f64,
     /// End of the last step.
     last: Instant,
     /// Number of steps that this process has taken.
@@ -63,7 +63,7 @@ impl TimeLeft {
         let is_grid = matches!(params.field, ResolvedField::Grid { .. });
         Self {
             has_course: is_grid && !is_initialised,
-            single_ray_share: params.single_ray_share(),
+            single_rays: params.single_rays(),
             last: Instant::now(),
             steps: 0.0,
             seconds: 0.0,
@@ -93,26 +93,26 @@ impl TimeLeft {
         }
         // The recent steps' average is the pace of half a window ago, which matters at first.
         let before = (step as f64 - MIN_WINDOW_STEPS / 2.0).max(0.0);
-        let (total, remaining) = (rays.total.max(1) as f64, rays.remaining as f64);
-        let left_before = (remaining + self.rays / 2.0).min(total);
-        let cost = self.cost(before, 1.0 - left_before / total);
+        let (total, remaining) = (rays.total as f64, rays.remaining as f64);
+        let done = total - remaining;
+        let cost = self.cost(before, done - self.rays / 2.0);
         let late_rays_per_step = (cost * self.rays / self.window().min(self.steps)).max(1.0);
-        let own = self.late_rays(step as f64, remaining, total, late_rays_per_step);
-        let each = self.late_rays(0.0, total, total, late_rays_per_step);
-        let others = rays.further as f64 / total * each;
+        let own = self.late_rays(step as f64, done, remaining, late_rays_per_step);
+        let each = self.late_rays(0.0, 0.0, total, late_rays_per_step);
+        let others = rays.further as f64 / total.max(1.0) * each;
         self.seconds / self.rays / cost * (own + others)
     }
 
-    /// Returns the number of late rays that cost as much as the last `remaining` of `total` rays,
-    /// from a step on.
-    fn late_rays(&self, mut step: f64, remaining: f64, total: f64, late_rays_per_step: f64) -> f64 {
-        let (mut sum, mut left) = (0.0, remaining);
+    /// Returns the number of late rays that cost as much as `rays`, from a step on, after `done`
+    /// rays.
+    fn late_rays(&self, mut step: f64, mut done: f64, rays: f64, late_rays_per_step: f64) -> f64 {
+        let mut sum = 0.0;
         for part in 1..=PARTS {
             // Later parts are larger, since costs change early.
-            let part = remaining * f64::from(part) / f64::from(PARTS * (PARTS + 1) / 2);
-            let late_rays = part * self.cost(step, 1.0 - left / total);
+            let part = rays * f64::from(part) / f64::from(PARTS * (PARTS + 1) / 2);
+            let late_rays = part * self.cost(step, done);
             sum += late_rays;
-            left -= part;
+            done += part;
             // Steps have about equal costs.
             step += late_rays / late_rays_per_step;
         }
@@ -124,16 +124,17 @@ impl TimeLeft {
         (self.steps / STEPS_PER_WINDOW_STEP).max(MIN_WINDOW_STEPS)
     }
 
-    /// Returns the cost of a ray at a step and after a fraction of the rays, relative to a late ray.
-    fn cost(&self, step: f64, fraction: f64) -> f64 {
+    /// Returns the cost of a ray at a step, after `done` rays, relative to a late ray.
+    fn cost(&self, step: f64, done: f64) -> f64 {
         if !self.has_course {
             return 1.0;
         }
-        let bundle = if fraction < self.single_ray_share { SINGLE_RAY_COST } else { 1.0 };
-        bundle * Self::course_cost(step)
+        let factor = if done < self.single_rays { SINGLE_RAY_COST } else { 1.0 };
+        factor * Self::course(step)
     }
 
-    fn course_cost(step: f64) -> f64 {
+    /// Returns the value of [`COURSE`] at a step.
+    fn course(step: f64) -> f64 {
         let after = COURSE.iter().position(|(end, _)| *end > step).unwrap_or(COURSE.len());
         let Some(&(end, end_cost)) = COURSE.get(after) else { return 1.0 };
         let (start, start_cost) = COURSE[after - 1];
@@ -173,7 +174,7 @@ mod tests {
     fn unmeasured() -> TimeLeft {
         let zero = TimeLeft {
             has_course: true,
-            single_ray_share: 0.3,
+            single_rays: 0.0,
             last: Instant::now(),
             steps: 0.0,
             seconds: 0.0,
@@ -189,7 +190,7 @@ mod tests {
 
     /// Returns the elapsed and the estimated remaining seconds at each point of a measured course.
     fn estimates(course: &[(u64, u64, f64)], total: u64) -> Vec<(f64, f64)> {
-        let mut time_left = unmeasured();
+        let mut time_left = TimeLeft { single_rays: 0.3 * total as f64, ..unmeasured() };
         let mut previous = (0, 0, 0.0);
         let mut estimates = Vec::new();
         for &(step, done, seconds) in course {
@@ -240,9 +241,21 @@ mod tests {
     #[test]
     fn costs_fall_to_one() {
         let time_left = unmeasured();
-        let costs: Vec<f64> = (0..100).map(|i| time_left.cost(f64::from(i * 50), 0.5)).collect();
+        let costs: Vec<f64> = (0..100).map(|i| time_left.cost(f64::from(i * 50), 0.0)).collect();
         assert!(costs.is_sorted_by(|a, b| a >= b));
         assert_eq!((costs[0], costs[99]), (COURSE[0].1, 1.0));
-        assert_eq!(time_left.cost(5000.0, 0.2), SINGLE_RAY_COST);
+    }
+
+    /// Single rays are slower than the bundles that follow.
+    #[test]
+    fn time_left_falls_when_pixels_get_several_rays() {
+        let mut time_left = TimeLeft { single_rays: 30_000.0, ..unmeasured() };
+        for _ in 0..100 {
+            time_left.add_seconds(100, 0.5 * SINGLE_RAY_COST);
+        }
+        let seconds = time_left.seconds(5000, rays(100_000, 10_000));
+        // 200 steps of single rays, and 700 of others; parts are counted whole.
+        let expected = 200.0 * 0.5 * SINGLE_RAY_COST + 700.0 * 0.5;
+        assert!((seconds / expected - 1.0).abs() < 0.01, "{seconds} s for {expected} s");
     }
 }
