@@ -197,7 +197,8 @@ impl<'a> Member<'a> {
     ) -> anyhow::Result<Outcome> {
         let total = self.params.rays;
         let Training { trainer, supervision, checkpoints, curve } = training;
-        let mut time_left = TimeLeft::new(&self.params, self.init.is_some());
+        let background = data.views.background;
+        let mut time_left = TimeLeft::new(&self.params, self.init.is_some(), background);
         loop {
             let is_interrupted = self.context.is_interrupted();
             checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
