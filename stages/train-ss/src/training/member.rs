@@ -197,8 +197,10 @@ impl<'a> Member<'a> {
     ) -> anyhow::Result<Outcome> {
         let total = self.params.rays;
         let Training { trainer, supervision, checkpoints, curve } = training;
+        let (is_initialised, has_silhouettes) = (self.init.is_some(), data.cells.is_some());
         let background = data.views.background;
-        let mut time_left = TimeLeft::new(&self.params, self.init.is_some(), background);
+        let mut time_left =
+            TimeLeft::new(&self.params, is_initialised, has_silhouettes, background);
         loop {
             let is_interrupted = self.context.is_interrupted();
             checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
