@@ -159,10 +159,16 @@ impl<'a> Member<'a> {
         self.work.as_ref().is_some_and(|work| work.is_dir())
     }
 
+    /// Returns the mask of the cells that silhouettes leave. While cameras move, their silhouettes
+    /// would empty wrong cells.
+    fn known_cells<'d>(&self, data: &TrainingData<'d>) -> Option<&'d [bool]> {
+        data.cells.filter(|_| !self.params.pose_refinement)
+    }
+
     /// Starts training, or resumes from the last checkpoint in the work folder.
     fn start(&self, data: &TrainingData<'_>) -> anyhow::Result<Training> {
         let (params, work) = (&self.params, self.work.as_deref());
-        let TrainingData { input, references, views, cells, .. } = *data;
+        let TrainingData { input, references, views, .. } = *data;
         let folder = self.pixel_folder();
         if let Some(work) = work {
             std::fs::create_dir_all(work)
@@ -180,8 +186,7 @@ impl<'a> Member<'a> {
             );
             return Err(Failure::Usage(message).into());
         }
-        // While cameras move, their silhouettes would empty wrong cells.
-        let cells = cells.filter(|_| !params.pose_refinement);
+        let cells = self.known_cells(data);
         let checkpoints = Checkpoints::new(work);
         let (trainer, curve) =
             checkpoints.resume(|| self.new_trainer(views.bounds, cells), &mut supervision, log)?;
@@ -197,7 +202,8 @@ impl<'a> Member<'a> {
     ) -> anyhow::Result<Outcome> {
         let total = self.params.rays;
         let Training { trainer, supervision, checkpoints, curve } = training;
-        let (is_initialised, has_silhouettes) = (self.init.is_some(), data.cells.is_some());
+        let (is_initialised, has_silhouettes) =
+            (self.init.is_some(), self.known_cells(data).is_some());
         let background = data.views.background;
         let mut time_left =
             TimeLeft::new(&self.params, is_initialised, has_silhouettes, background);
